@@ -1,0 +1,84 @@
+"""Derivatives of the catalogue's formulas, for the second-order fit.
+
+Each function takes the leaf's own ``value`` and ``facing`` (n.l), both (K, N) for K leaves at N pixels, the pixels'
+``grazing`` (1 - n.v) and the leaf's scalars (K, 1); it returns the derivative by n.l and then by each scalar, (K, N).
+A kind that is not listed here is differentiated by forward-mode automatic differentiation, so that a kind from outside
+the package can be fitted too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+import torch.autograd.forward_ad as forward_ad
+
+from unshade.nodes import KINDS
+from unshade.shading import SHARPEST_EDGE
+from unshade.types import Params
+
+Derivatives = tuple[torch.Tensor, ...]
+
+
+def diffuse(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, ambient: Params) -> Derivatives:
+    return (1.0 - ambient) * (facing > 0.0), 1.0 - facing.clamp(min=0.0)
+
+
+def highlight(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, sharpness: Params, amplitude: Params) -> Derivatives:
+    open_value = value * (value < 1.0)
+    return 2.0 * sharpness * open_value, 2.0 * (facing - 1.0) * open_value, open_value / amplitude.clamp(min=1e-6)
+
+
+def rim(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, exponent: Params) -> Derivatives:
+    return grazing**exponent * (facing > 0.0), value * grazing.log()
+
+
+def _edge(facing: torch.Tensor, low: Params, width: Params) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """smoothstep(low, width, facing): its value, its slope, and the position t in the edge."""
+    width = width.clamp(min=SHARPEST_EDGE)
+    t = ((facing - low) / width).clamp(0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t), 6.0 * t * (1.0 - t) / width, t
+
+
+def toon_diffuse(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, ambient: Params, threshold: Params, softness: Params) -> Derivatives:
+    step, slope, t = _edge(facing, threshold, softness)
+    slope = (1.0 - ambient) * slope
+    return slope, 1.0 - step, -slope, -slope * t
+
+
+def toon_highlight(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, radius: Params, brightness: Params, softness: Params) -> Derivatives:
+    step, slope, t = _edge(facing, radius.cos() - 0.5 * softness, softness)
+    slope = brightness * slope
+    return slope, slope * radius.sin(), step, slope * (0.5 - t)
+
+
+def threshold(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, threshold: Params, softness: Params) -> Derivatives:
+    _, slope, t = _edge(facing, threshold - 0.5 * softness, softness)
+    return slope, -slope, slope * (0.5 - t)
+
+
+def stripe(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, center: Params, width: Params, softness: Params) -> Derivatives:
+    offset = facing - center
+    _, slope, t = _edge(offset.abs(), 0.5 * (width - softness), softness)
+    outward = slope * offset.sign()
+    return -outward, outward, 0.5 * slope, slope * (t - 0.5)
+
+
+ANALYTIC: dict[str, Callable[..., Derivatives]] = {
+    function.__name__: function for function in (diffuse, highlight, rim, toon_diffuse, toon_highlight, threshold, stripe)
+}
+
+
+def forward_mode(kind: str, normals: torch.Tensor, parameters: list[torch.Tensor], tangents: list[torch.Tensor]) -> torch.Tensor:
+    """Directional derivatives of leaves of a kind, by dual numbers.
+
+    Args:
+        normals: (3, 1, N). parameters: one (K, ...) a parameter. tangents: one (D, K, ...) a parameter.
+    Returns:
+        (D, K, C, N).
+    """
+    with forward_ad.dual_level():
+        dual = [forward_ad.make_dual(p.expand_as(t).contiguous(), t.contiguous()) for p, t in zip(parameters, tangents, strict=True)]
+        tangent = forward_ad.unpack_dual(KINDS[kind].formula(normals, *dual)).tangent
+        shape = torch.broadcast_shapes(tangents[0].shape[:2])
+    return tangent.expand(*shape, *tangent.shape[-3:])[..., 0, :]
