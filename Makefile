@@ -43,7 +43,7 @@ test: lint pytest
 lint: $(VENV)/.dev
 	@$(BIN)/ruff check --quiet src tests scripts
 	@$(BIN)/mypy
-	@$(BIN)/lint-imports --no-timing
+	@$(BIN)/lint-imports --no-logo
 
 pytest: $(VENV)/.dev
 	@$(PY) -m pytest -q -n 2 --dist worksteal

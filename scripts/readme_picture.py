@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
-
 from unshade.decompose import decompose
 from unshade.metrics import psnr
+from unshade.pictures import read_sphere
+
 from unshade.nodes import Leaf, Node, Role, Tree, count_values, steps, tint
 from unshade.parameters import Layout
-from unshade.pictures import read_sphere
 from unshade.render import evaluate, render
 from unshade.sphere import disc_mask, sphere_normals
 
