@@ -1,0 +1,331 @@
+"""The report of a decomposition: one HTML file that opens offline, with every picture inside.
+
+The page shows one tree of the family at a time. Each tree's part of the page, its *sheet*, stands in a `<template>`,
+and choosing a point of the curve puts it in place; without a script the chosen tree is shown.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from unshade import labels
+from unshade.drawing import STYLE, data_uri, tree_svg
+from unshade.labels import escape, number
+from unshade.nodes import KINDS, Leaf, Member, Node, Parameter, Raster, Tree, walk
+from unshade.render import part, render
+from unshade.report_chart import Point, chart
+from unshade.serde import dumps, to_text
+from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
+
+if TYPE_CHECKING:
+    from unshade.decompose import Result
+    from unshade.pictures import SphereImage
+
+BUDGET = 1_300_000
+"""Characters of all sheets together. The trees nearest to the chosen one get theirs first."""
+
+GAINS = (1, 2, 4, 8, 16, 32, 64)
+"""How many times brighter the difference may be shown."""
+
+FINE, COARSE = 160, 80
+"""Pixels of a thumbnail of the chosen tree, and of the others."""
+
+SLOTS = ("figures", "pictures", "tree", "leaves", "parts", "text")
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """What every sheet is compared with."""
+
+    image: torch.Tensor
+    counted: torch.Tensor
+    """(1, S, S) bool: the pixels that are scored."""
+    gain: int
+
+    def difference(self, rendered: torch.Tensor) -> torch.Tensor:
+        """(4, S, S): the amplified absolute difference, transparent where nothing is compared."""
+        return torch.cat([(rendered - self.image).abs() * self.gain, self.counted.to(rendered.dtype)])
+
+
+def report_html(result: Result, sphere: SphereImage, source_name: str, figures: Mapping[str, Any]) -> str:
+    """The whole page.
+
+    Args:
+        result: the chosen tree and its family.
+        sphere: the picture that was decomposed.
+        source_name: what to call the picture.
+        figures: any of ``psnr``, ``ssim``, ``st_lpips``, ``values``, ``leaves``, ``seconds``, ``seed`` and ``preset``; None is left out.
+    """
+    family = result.family
+    image = sphere.image.detach().float().cpu()
+    size = image.shape[-1]
+    rendered = render(result.tree, sphere_normals(size))
+    counted = disc_mask(size, SCORED_RADIUS) & sphere.valid.cpu()
+    picture = _Picture(image, counted, _gain(((rendered - image).abs() * counted)))
+
+    keys = [f"tree-{index}" for index in range(len(family.members))]
+    others = [f"other-{index}" for index in range(len(family.alternatives))]
+    chosen = keys[family.chosen]
+    members = dict(zip([*keys, *others], [*family.members, *family.alternatives], strict=True))
+    members[chosen] = Member(result.tree, result.psnr)
+    sheets = {chosen: _sheet(chosen, members[chosen], picture, {"seed": result.seed, "preset": result.preset, **figures}, fine=True)}
+    room = BUDGET - _length(sheets[chosen])
+    for key in sorted(members, key=lambda key: (key in keys, abs(keys.index(key) - family.chosen) if key in keys else 0)):
+        if key != chosen:
+            sheet = _sheet(key, members[key], picture, {})
+            room -= _length(sheet)
+            if room < 0:
+                break
+            sheets[key] = sheet
+
+    points = [Point(key, member.values, member.psnr, key in sheets, key == chosen, key in others) for key, member in members.items()]
+    template = (resources.files("unshade") / "report_template.html").read_text(encoding="utf-8")
+    return _filled(
+        template,
+        {
+            "title": escape(source_name),
+            "tree_style": STYLE,
+            "chosen": chosen,
+            "input": data_uri(image, "webp"),
+            "size": str(size),
+            "chart": chart(points),
+            "strip": "".join(_choice(key, members[key], key == chosen) for key in keys if key in sheets),
+            "others": _others({key: members[key] for key in others if key in sheets}),
+            "count": str(len(keys)),
+            "templates": "".join(_template(key, members[key], sheet) for key, sheet in sheets.items() if key != chosen),
+            "chosen_words": escape(_words(members[chosen])),
+            "json": base64.b64encode(dumps(family).encode()).decode(),
+            "file_name": escape(re.sub(r"[^\w.-]+", "_", source_name).rpartition(".")[0] or "tree") + ".tree.json",
+            **{f"slot_{slot}": sheets[chosen][slot] for slot in SLOTS},
+        },
+    )
+
+
+def _filled(template: str, values: Mapping[str, str]) -> str:
+    """Replace every ``{{name}}`` in one pass, so that what is put in is never searched again."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found[1]], template)
+
+
+def _length(sheet: Mapping[str, str]) -> int:
+    return sum(len(part) for part in sheet.values())
+
+
+def _gain(difference: torch.Tensor) -> int:
+    """The largest gain that keeps all but the worst half per cent of the pixels in range."""
+    worst = float(torch.quantile(difference.amax(0).flatten(), 0.995))
+    return max((gain for gain in GAINS if gain * worst <= 1.0), default=1)
+
+
+def _words(member: Member) -> str:
+    return f"{member.values} values, {number(member.psnr)} dB"
+
+
+def _sheet(key: str, member: Member, picture: _Picture, figures: Mapping[str, Any], fine: bool = False) -> dict[str, str]:
+    """Everything on the page that belongs to one tree."""
+    tree, size = member.tree, picture.image.shape[-1]
+    rendered = render(tree, sphere_normals(size))
+    shown = {"psnr": member.psnr, "values": tree.values, "leaves": tree.leaves, **{name: value for name, value in figures.items() if value is not None}}
+    encoding = "webp" if fine else "webp-lossy"
+    drawn = tree_svg(
+        tree,
+        title=f"Shade tree of {_words(member)}: {labels.outline(tree)}",
+        thumbnail=FINE if fine else COARSE,
+        encoding="webp-lossy",
+        quality=88 if fine else 80,
+        prefix=key,
+        standalone=False,
+    )
+    return {
+        "figures": _figures(shown),
+        "pictures": _figure("Render", f"the tree’s {tree.values} values", data_uri(rendered, encoding), f"Render of the tree, {_words(member)}", size, "render")
+        + _figure(
+            "Difference",
+            f"absolute, {picture.gain} × brighter" if picture.gain > 1 else "absolute",
+            data_uri(picture.difference(rendered), "webp-lossy"),
+            f"Absolute difference between input and render, {picture.gain} times brighter",
+            size,
+            "difference",
+        ),
+        "tree": drawn,
+        "leaves": "".join(_cards(tree, key)),
+        "parts": _parts(tree, 192 if fine else 128),
+        "text": escape(to_text(tree)),
+    }
+
+
+def _figures(figures: Mapping[str, Any]) -> str:
+    """The numbers below the title, in a fixed order; names that are not known here come last as they are."""
+    known = {
+        "psnr": ("PSNR", " dB"),
+        "ssim": ("SSIM", ""),
+        "st_lpips": ("ST-LPIPS", ""),
+        "values": ("values", ""),
+        "leaves": ("leaves", ""),
+        "seconds": ("seconds", ""),
+        "preset": ("preset", ""),
+        "seed": ("seed", ""),
+    }
+    parts = []
+    for name in [*known, *(name for name in figures if name not in known)]:
+        if name in figures:
+            value = figures[name]
+            words, unit = known.get(name, (labels.kind_words(name), ""))
+            text = value if isinstance(value, str) else str(value) if isinstance(value, int) else f"{value:.1f}" if name == "psnr" and math.isfinite(value) else number(value)
+            parts.append(f'<div><dt>{escape(words)}</dt><dd>{escape(text)}<small>{unit}</small></dd></div>')
+    return "".join(parts)
+
+
+def _figure(title: str, words: str, uri: str, alt: str, size: int, name: str) -> str:
+    return (
+        f'<figure data-picture="{name}"><img class="disc" src="{uri}" width="{size}" height="{size}" alt="{escape(alt)}">'
+        f"<figcaption><b>{escape(title)}</b> <span>{escape(words)}</span></figcaption></figure>"
+    )
+
+
+def _parts(tree: Tree, size: int) -> str:
+    """The diffuse and the specular part, as `render.part` tells them apart."""
+    about = {
+        "diffuse": ("Diffuse part", "paint and form, every light black"),
+        "specular": ("Specular part", "highlights, rims and reflections alone"),
+    }
+    parts = []
+    for which, (title, words) in about.items():
+        rendered = render(dataclasses.replace(tree, root=part(tree.root, which)), sphere_normals(size))
+        parts.append(_figure(title, words, data_uri(rendered, "webp-lossy"), f"{title}: {words}", size, which))
+    return "".join(parts)
+
+
+def _choice(key: str, member: Member, chosen: bool) -> str:
+    """A button of the strip of renders."""
+    small = render(member.tree, sphere_normals(64))
+    return (
+        f'<button type="button" class="choice" data-show="{key}" aria-pressed="{"true" if chosen else "false"}" title="{escape(labels.outline(member.tree))}">'
+        f'<img class="disc" src="{data_uri(small, "webp-lossy", 80)}" width="64" height="64" alt="">'
+        f'<span class="amount">{member.values}<span class="unseen"> values</span></span><span class="quality">{number(member.psnr)} dB</span></button>'
+    )
+
+
+def _others(members: Mapping[str, Member]) -> str:
+    """Trees of the chosen size with another structure."""
+    if not members:
+        return ""
+    cards = "".join(
+        f'<li>{_choice(key, member, False)}<p>{escape(labels.outline(member.tree))}</p></li>' for key, member in members.items()
+    )
+    return f'<div class="others"><h3>Other explanations</h3><p class="quiet">A picture has several: trees of about the same size with another structure.</p><ul>{cards}</ul></div>'
+
+
+def _template(key: str, member: Member, sheet: Mapping[str, str]) -> str:
+    slots = "".join(f'<div data-slot="{slot}">{sheet[slot]}</div>' for slot in SLOTS)
+    return f'<template data-sheet="{key}" data-words="{escape(_words(member))}">{slots}</template>\n'
+
+
+def _cards(tree: Tree, key: str) -> Iterator[str]:
+    """One card a leaf; a light with its own albedo shares one."""
+    hidden: set[int] = set()
+    for index, (address, node) in enumerate(walk(tree.root)):
+        pair = labels.folds(node)
+        if pair:
+            hidden |= {index + 1, index + 2}
+            yield _card(tree, f"{key}-{index}", address, node, pair[1], pair[0])
+        elif isinstance(node, Leaf) and index not in hidden:
+            yield _card(tree, f"{key}-{index}", address, node, node)
+
+
+def _card(tree: Tree, place: str, address: str, node: Node, leaf: Leaf, tint: Leaf | None = None) -> str:
+    """A leaf with its picture, name, address, role and every value.
+
+    Args:
+        place: id of the symbol with the node's picture in the drawn tree.
+        node: the leaf, or the multiply of a tinted light.
+    """
+    rows = [_row("tint", _swatch(labels.shown_color(tint["color"], tree.blend_space)))] if tint else []  # type: ignore[arg-type]
+    rows += _lights(leaf, tree.blend_space) if leaf.lobes > 1 else [_row(p.name, _value(p, value, tree.blend_space), p.meaning) for p, value in labels.stored(leaf)]
+    name = labels.label(node)
+    kind = labels.kind_words(leaf.kind)
+    said = f"tinted {kind}" if tint else kind
+    return (
+        f'<li class="card" data-address="{escape(address)}">'
+        f'<svg class="portrait" viewBox="0 0 1 1" aria-hidden="true"><use href="#{place}"/></svg>'
+        f'<div><h3>{escape(name)}{f" <small>{escape(said)}</small>" if name != said else ""}</h3>'
+        f'<p class="about"><span class="role role-{leaf.role.value}">{leaf.role.value}</span> <code>{escape(address)}</code></p>'
+        f"<dl>{''.join(rows)}</dl></div></li>\n"
+    )
+
+
+def _row(name: str, value: str, meaning: str = "") -> str:
+    return f'<div><dt{f""" title="{escape(meaning)}" """ if meaning else ""}>{escape(labels.kind_words(name))}</dt><dd>{value}</dd></div>'
+
+
+def _value(parameter: Parameter, value: Sequence[float] | Raster, space: str) -> str:
+    """A parameter's value as a picture and in words."""
+    if isinstance(value, Raster):
+        stored = value.channels * value.height * value.width
+        picture = data_uri(value.tensor(), "webp-lossy")
+        return f'<img class="raster" src="{picture}" alt="" width="{value.width}" height="{value.height}"> <span>{value.width} × {value.height}, {stored} values</span>'
+    if parameter.type == "color":
+        return _swatch(labels.shown_color(value, space))
+    if parameter.type == "direction":
+        return f'{_dial([(tuple(value), "")])}<span>{labels.direction(value)}</span>'
+    if parameter.type == "rotation":
+        return f"<span>{', '.join(number(part) for part in value)} {escape(parameter.unit)}</span>"
+    return _bar(parameter, value[0])
+
+
+def _bar(parameter: Parameter, value: float) -> str:
+    """A number on the bar of its range."""
+    low, high = parameter.low, parameter.high
+    if parameter.logarithmic:
+        share = math.log(value / low) / math.log(high / low)
+    else:
+        share = (value - low) / (high - low) if high > low else 0.0
+    said = f"{number(low)} to {number(high)}{', logarithmic' if parameter.logarithmic else ''}"
+    return (
+        f'<span class="bar" title="{said}" style="--at:{100 * min(max(share, 0.0), 1.0):.1f}%"></span>'
+        f'<span class="number" title="{value!r}">{number(value)}</span>'
+    )
+
+
+def _swatch(color: str) -> str:
+    return f'<span class="swatch" style="--color:{color}"></span><code>{color}</code>'
+
+
+def _dial(lights: Sequence[tuple[tuple[float, ...], str]]) -> str:
+    """Directions as dots on a small sphere seen from the front; a hollow dot is on its far side."""
+    dots = []
+    for (x, y, z), color in lights:
+        fill = f' style="--color:{color}"' if color else ""
+        dots.append(f'<circle class="{"near" if z >= 0 else "far"}" cx="{19 + 16 * x:.1f}" cy="{19 - 16 * y:.1f}" r="3"{fill}/>')
+    words = "; ".join(labels.direction_words(vector) for vector, _ in lights)
+    return (
+        f'<svg class="dial" viewBox="0 0 38 38" width="38" height="38" role="img" aria-label="{words}"><title>{words}</title>'
+        f'<circle class="globe" cx="19" cy="19" r="16"/><path class="axes" d="M3 19H35M19 3V35"/>{"".join(dots)}</svg>'
+    )
+
+
+def _lights(leaf: Leaf, space: str) -> list[str]:
+    """The lobes of an environment: all on one sphere, then each with its numbers."""
+    stored = {parameter.name: labels.entries(parameter, value) for parameter, value in labels.stored(leaf) if not isinstance(value, Raster)}
+    parameters = {parameter.name: parameter for parameter in KINDS[leaf.kind].parameters}
+    directions = next((stored[name] for name in stored if parameters[name].type == "direction"), [])
+    colors = next((stored[name] for name in stored if parameters[name].type == "color"), [(1.0, 1.0, 1.0)] * leaf.lobes)
+    rows = [_row(f"{leaf.lobes} lights", _dial([(at, labels.shown_color(color, space)) for at, color in zip(directions, colors, strict=False)]))]
+    for index in range(leaf.lobes):
+        words = []
+        for name, entries in stored.items():
+            entry = entries[index]
+            kind = parameters[name].type
+            shown = labels.direction(entry) if kind == "direction" else _swatch(labels.shown_color(entry, space)) if kind == "color" else f"{name} {number(entry[0])}"
+            words.append(f"<span>{shown}</span>")
+        rows.append(_row(f"light {index + 1}", "".join(words)))
+    return rows
