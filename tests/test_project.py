@@ -115,13 +115,13 @@ def test_links_lead_somewhere(document: Path) -> None:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_documented_commands_exist(document: Path) -> None:
-    from unshade.cli import main
+    from unshade.cli import cli
 
-    assert isinstance(main, click.Group)
+    assert isinstance(cli, click.Group)
     for block in re.findall(r"^```sh\n(.*?)^```", document.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
         for verb, rest in re.findall(r"^\s*unshade ([a-z]+)(.*)$", block, re.MULTILINE):
-            assert verb in main.commands, f"{document.name}: there is no `unshade {verb}`"
-            known = {option for parameter in main.commands[verb].params for option in parameter.opts} | {"--help"}
+            assert verb in cli.commands, f"{document.name}: there is no `unshade {verb}`"
+            known = {option for parameter in cli.commands[verb].params for option in parameter.opts} | {"--help"}
             for option in re.findall(r"(?<=\s)--?[a-z][a-z-]*", rest.partition("#")[0]):
                 assert option in known, f"{document.name}: `unshade {verb}` has no {option}"
 
