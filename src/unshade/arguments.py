@@ -1,0 +1,100 @@
+"""What the verbs of the command line take: options that several share, a disc, and a TREE in any of its forms."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from unshade.errors import TreeError
+from unshade.staging import TREE_FILE
+
+if TYPE_CHECKING:
+    from unshade.nodes import Family, Tree
+
+SEED = click.IntRange(0, 2**63 - 1)
+
+
+class Disc(click.ParamType):
+    """``cx,cy,r`` in pixels."""
+
+    name = "cx,cy,r"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        """Three numbers, the last over 0."""
+        if isinstance(value, tuple):
+            return value
+        with contextlib.suppress(ValueError):
+            numbers = tuple(float(part) for part in value.split(","))
+            if len(numbers) == 3 and numbers[2] > 0 and all(abs(number) < 1e6 for number in numbers):
+                return numbers
+        raise click.BadParameter(f"expected three numbers cx,cy,r in pixels such as 128,128,100, got {value!r}", ctx, param)
+
+
+def output_options(function: Any) -> Any:
+    """What `decompose` and `fit` share."""
+    for option in (
+        click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors."),
+        click.option("--json", "as_json", is_flag=True, help="Print one JSON object a picture, one a line, on standard output."),
+        click.option("--perceptual", is_flag=True, help="Measure st_lpips too (about a second a picture); else it is null."),
+        click.option(
+            "--artifacts",
+            type=click.Choice(["none", "tree", "all"]),
+            default="all",
+            show_default=True,
+            help="What to write: nothing, tree.json only, or also the pictures, the drawn tree and the report.",
+        ),
+        click.option("--mask", type=click.Path(), metavar="FILE", help="A picture of the pixels to ignore: white is ignored."),
+        click.option(
+            "--disc", type=Disc(), help="Centre and radius of the sphere in pixels of the picture; found by itself when not given."
+        ),
+        click.option("--seed", type=SEED, default=0, show_default="0", metavar="N", help="The same seed gives the same tree, bit for bit."),
+    ):
+        function = option(function)
+    return function
+
+
+def read_tree(source: str, text_only: bool = False) -> Tree:
+    """The tree of a TREE argument. Raises TreeError."""
+    return read_document(source, text_only)[0]
+
+
+def read_document(source: str, text_only: bool = False) -> tuple[Tree, Family | None]:
+    """The tree of a TREE argument, and its family where the file has one. Raises TreeError."""
+    from unshade import serde
+
+    path = None if text_only or source == "-" else _file(source)
+    try:
+        if path is not None:
+            tree, text = serde.load(path), path.read_text(encoding="utf-8")
+        elif source == "-" or text_only or "(" in source:
+            text = sys.stdin.read() if source == "-" else source
+            tree = serde.loads(text)
+        else:
+            raise TreeError(f"expected a tree file, a folder with a {TREE_FILE}, or a tree's text such as albedo(#cc2030)")
+        return tree, serde.loads_family(text) if re.search(r'"family"\s*:', text) else None
+    except TreeError as error:
+        raise _named(error, "standard input" if source == "-" else str(path or source)) from error
+
+
+def _named(error: TreeError, source: str) -> TreeError:
+    """The error with the name of what was read, where it does not say so; a tree's text is shown by the error itself."""
+    message = str(error)
+    named = message if source in message or "(" in source else f"{source}: {message}"
+    renamed = TreeError(named)
+    renamed.address = error.address
+    return renamed
+
+
+def _file(source: str) -> Path | None:
+    """The file that a TREE argument names, if it does."""
+    # A tree's text may be longer than a file name can be.
+    with contextlib.suppress(OSError, ValueError):
+        path = Path(source)
+        path = path / TREE_FILE if path.is_dir() else path
+        return path if path.exists() else None
+    return None

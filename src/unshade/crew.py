@@ -1,0 +1,129 @@
+"""Jobs on several processes: one at a time each, a process that dies costs its own job only, an interrupt ends them all."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import multiprocessing.connection
+import signal
+import sys
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from typing import Any, Generic, TypeVar
+
+Job = TypeVar("Job")
+Answer = TypeVar("Answer")
+
+
+def run(
+    jobs: Sequence[Job],
+    workers: int,
+    work: Callable[[Job], Answer],
+    lost: Callable[[Job, int | None], Answer],
+    abandoned: Callable[[Job], None],
+) -> Generator[tuple[Job, Answer]]:
+    """Do the jobs on ``workers`` processes and yield each with its answer as it is done, in any order.
+
+    Processes are spawned, hence ``work``, the jobs and the answers must be picklable. One worker, or one job, is done
+    in this process. Closing the generator, or an interrupt, ends the workers.
+
+    Args:
+        jobs: what to do.
+        workers: most processes at once.
+        work: does one job; it should not raise.
+        lost: the answer for a job whose process died, from its exit code.
+        abandoned: cleans up after a job that was cut short.
+    """
+    if workers == 1 or len(jobs) <= 1:
+        for job in jobs:
+            yield job, work(job)
+        return
+    waiting = list(reversed(jobs))
+    crew: list[_Worker[Job, Answer]] = []
+    try:
+        while waiting or crew:
+            while waiting and len(crew) < workers:
+                crew.append(_Worker(work, waiting.pop()))
+            # With a time limit, since Windows cannot be interrupted in an endless wait.
+            ready = multiprocessing.connection.wait([worker.pipe for worker in crew], timeout=0.5)
+            for worker in [worker for worker in crew if worker.pipe in ready]:
+                job = worker.job
+                try:
+                    answer = worker.take()
+                except _Lost as loss:
+                    answer = lost(job, loss.code)
+                    abandoned(job)
+                if worker.alive and waiting:
+                    worker.give(waiting.pop())
+                else:
+                    crew.remove(worker)
+                    worker.end()
+                yield job, answer
+    finally:
+        for worker in crew:
+            worker.end(at_once=True)
+            abandoned(worker.job)
+
+
+class _Lost(Exception):  # noqa: N818 - a message from `take` to `run`, not an error to report
+    def __init__(self, code: int | None) -> None:
+        self.code = code
+
+
+class _Worker(Generic[Job, Answer]):
+    """One process and the job that it works on."""
+
+    def __init__(self, work: Callable[[Job], Answer], job: Job) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, other = context.Pipe()
+        self.process = context.Process(target=_serve, args=(other, work), daemon=True)
+        self.alive = True
+        with _uninterrupted():
+            self.process.start()
+        other.close()
+        self.give(job)
+
+    def give(self, job: Job) -> None:
+        """Start on a job."""
+        self.job = job
+        # A process that died in the meantime is noticed by `take`.
+        with contextlib.suppress(OSError):
+            self.pipe.send(job)
+
+    def take(self) -> Answer:
+        """The answer to the job. Raises _Lost where the process died over it."""
+        try:
+            answer: Answer = self.pipe.recv()
+        except (EOFError, OSError):
+            self.alive = False
+            self.process.join()
+            raise _Lost(self.process.exitcode) from None
+        return answer
+
+    def end(self, at_once: bool = False) -> None:
+        """Let the process go, after its job or now."""
+        if at_once:
+            self.process.terminate()
+        self.pipe.close()
+        self.process.join()
+
+
+def _serve(pipe: multiprocessing.connection.Connection[Any, Any], work: Callable[[Any], Any]) -> None:
+    """A worker's life: jobs in, answers out, until the pipe closes. Ctrl-C is for the parent to handle."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            pipe.send(work(pipe.recv()))
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Processes started in here ignore Ctrl-C from their first moment on, before they can say so themselves."""
+    if threading.current_thread() is not threading.main_thread() or sys.platform == "win32":
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
