@@ -136,8 +136,9 @@ def _decode(path: Path, image: PILImage.Image, colors: bool) -> Picture:
     if frames > 1 and image.format != "MPO":
         raise PictureError(f"{path}: expected one picture, got {frames} frames or pages; save the one you mean by itself")
     profile = color_profiles.declared(path, image) if colors else None
-    orientation = image.getexif().get(0x0112, 1)
     pixels, alpha = _channels(path, image, profile)
+    # After the pixels: asking a PNG for its EXIF decodes it, and with that the depth of its file is forgotten.
+    orientation = image.getexif().get(0x0112, 1)
     if isinstance(profile, color_profiles.Primaries):
         pixels = profile.to_srgb(pixels)
     pixels = _upright(pixels, orientation)

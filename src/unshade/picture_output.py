@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import struct
 import tempfile
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from PIL import Image as PILImage
 from unshade import scene_linear
 from unshade.color_profiles import srgb_decode
 from unshade.errors import OutputError
+from unshade.png import write_png
 from unshade.types import Image, Mask
 
 _PILLOW = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WEBP", ".tif": "TIFF", ".tiff": "TIFF", ".bmp": "BMP"}
@@ -89,7 +88,7 @@ def _writer(suffix: str, color: NDArray[np.float64], alpha: NDArray[np.float64] 
         color, alpha = color * alpha[..., None], None
     channels = color if alpha is None else np.concatenate([color, alpha[..., None]], axis=-1)
     if bits == 16:
-        data = png16(np.round(channels * 65535).astype(np.uint16))
+        data = write_png(np.round(np.moveaxis(channels, -1, 0) * 65535).astype(np.uint16))
         return lambda path: _write_bytes(path, data)
     options: dict[str, object] = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"lossless": True, "exact": True}}.get(_PILLOW[suffix], {})  # type: ignore[assignment]
     picture = PILImage.fromarray(np.round(channels * 255).astype(np.uint8))
@@ -98,18 +97,3 @@ def _writer(suffix: str, color: NDArray[np.float64], alpha: NDArray[np.float64] 
 
 def _write_bytes(path: Path, data: bytes) -> None:
     path.write_bytes(data)
-
-
-def png16(pixels: NDArray[np.uint16]) -> bytes:
-    """A 16-bit PNG of (H, W), (H, W, 3) or (H, W, 4), which Pillow does not write in colour.
-
-    Source: PNG (third edition), 4.4, 9.2 (filter type 2, up) and 11.2.
-    """
-    planes = pixels[..., None] if pixels.ndim == 2 else pixels
-    height, width, channels = planes.shape
-    rows = planes.astype(">u2").view(np.uint8).reshape(height, -1)
-    above = np.concatenate([np.zeros_like(rows[:1]), rows[:-1]])
-    filtered = np.concatenate([np.full((height, 1), 2, dtype=np.uint8), rows - above], axis=1)
-    header = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"sRGB", b"\0"), (b"IDAT", zlib.compress(filtered.tobytes(), 6)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body)) for name, body in chunks)

@@ -100,7 +100,7 @@ def smoothness(rgb: Array) -> float:
     basis = np.array([np.cos(np.pi * k * steps) for k in range(12)])
     basis /= np.linalg.norm(basis, axis=1, keepdims=True)
     project = basis.T @ basis
-    rest = small - np.einsum("yi,xj,ijc->yxc", project, project, small)
+    rest = small - np.stack([project @ small[..., c] @ project for c in range(3)], axis=-1)
     error, variance = float(np.square(rest).mean()), float(np.square(small - small.mean((0, 1))).mean())
     if error < 0.012**2:
         return 1.0
@@ -190,16 +190,17 @@ def _background(rgb: Array) -> tuple[Array, float]:
     height, width = rgb.shape[:2]
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     edge = max(1, round(0.02 * min(height, width)))
+    powers = np.stack([x**i * y ** (degree - i) for degree in range(4) for i in range(degree + 1)], axis=-1)
     border = np.ones((height, width), dtype=bool)
     border[edge:-edge, edge:-edge] = False
     member, noise = border, 0.0
     surface = rgb
     for step in range(8):
         # The border alone does not say how a surface bends inside; higher terms join once the background is known.
-        terms = [x**i * y**j for i in range(4) for j in range(4 - i) if i + j <= (1 if step < 3 else 2 if step < 6 else 3)]
-        design = np.stack([term[member] for term in terms], axis=1)
-        weights, *_ = np.linalg.lstsq(design, rgb[member], rcond=None)
-        surface = np.einsum("tyx,tc->yxc", np.stack(terms), weights)
+        terms = powers[..., : 3 if step < 3 else 6 if step < 6 else 10]
+        design = terms[member]
+        weights = np.linalg.solve(design.T @ design + 1e-9 * np.eye(terms.shape[-1]), design.T @ rgb[member])
+        surface = terms @ weights
         distance = np.linalg.norm(rgb - surface, axis=-1)
         noise = float(1.4826 * np.median(distance[member]))
         limit = max(3.0 * noise, 0.01)

@@ -1,0 +1,1 @@
+"""Networks, one file each. Nothing below this floor loads one."""
