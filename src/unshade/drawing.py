@@ -132,6 +132,13 @@ def _plan(root: Node, fold: bool) -> _Box:
     return waiting[0]
 
 
+def _lines(box: _Box) -> int:
+    """Lines of text under a node: its name and its key values."""
+    if box.pair and isinstance(box.node, Operator):
+        return 2 + max(len(key_values(leaf, lines=2)) for leaf in box.node.children if isinstance(leaf, Leaf))
+    return 1 + len(key_values(box.node)) if isinstance(box.node, Leaf) else 2
+
+
 def _place(root: _Box) -> tuple[float, float]:
     """Set every box's x and y; the size of the whole."""
     depth, queue = 0.0, [(root, MARGIN, MARGIN)]
@@ -140,7 +147,7 @@ def _place(root: _Box) -> tuple[float, float]:
         box, left, top = queue.pop()
         order.append(box)
         box.x, box.y = left + box.width / 2, top
-        depth = max(depth, top + THUMB + (LINE * 4.4 if not box.pair else LINE * 4.4 + SMALL + 6.0))
+        depth = max(depth, top + THUMB + LINE * (_lines(box) + 0.6) + (SMALL if box.pair else 0.0))
         left += (box.width - sum(child.width for child in box.below)) / 2
         for child in box.below:
             queue.append((child, left, top + ROW))

@@ -102,15 +102,28 @@ def key_values(leaf: Leaf, space: str = "srgb", lines: int = 3) -> list[str]:
 
 
 def outline(tree: Tree) -> str:
-    """The leaves of a tree counted by kind, most basic first: ``albedo, diffuse, 4 highlights, rim``."""
-    nodes = [node for _, node in walk(tree.root)]
-    counts = Counter(node.kind for node in nodes if isinstance(node, Leaf))
-    tints = sum(folds(node) is not None for node in nodes)
-    counts["albedo"] -= tints
+    """The leaves of a tree counted by kind, paint first: ``albedo, diffuse, 4 tinted highlights, tinted rim``."""
+    counts: Counter[tuple[str, bool]] = Counter()
+    for _, node in walk(tree.root):
+        pair = folds(node)
+        if pair:
+            counts[pair[1].kind, True] += 1
+            counts["albedo", False] -= 1
+            counts[pair[1].kind, False] -= 1
+        elif isinstance(node, Leaf):
+            counts[node.kind, False] += 1
     place = {role: index for index, role in enumerate(Role)}
-    kinds = sorted((kind for kind in counts if counts[kind] > 0), key=lambda kind: place[KINDS[kind].role])
-    words = [kind_words(kind) if counts[kind] == 1 else f"{counts[kind]} {_plural(kind_words(kind))}" for kind in kinds]
-    return ", ".join(words + ([f"{tints} of them tinted"] if tints else []))
+    words = []
+    for (kind, tinted), count in sorted(counts.items(), key=lambda item: place[KINDS[item[0][0]].role]):
+        if count > 0:
+            word = f"{'tinted ' * tinted}{kind_words(kind)}{' mask' * (KINDS[kind].role is Role.MASK and not kind.endswith('mask'))}"
+            words.append(word if count == 1 else f"{count} {_plural(word)}")
+    return ", ".join(words)
+
+
+def decibels(psnr: float) -> str:
+    """``39.5 dB``; a render without an error has ``∞ dB``."""
+    return f"{psnr:.1f} dB" if math.isfinite(psnr) else f"{number(psnr)} dB"
 
 
 def _plural(word: str) -> str:

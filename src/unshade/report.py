@@ -21,7 +21,7 @@ import torch
 from unshade import labels
 from unshade.drawing import STYLE, data_uri, tree_svg
 from unshade.labels import escape, number
-from unshade.nodes import KINDS, Leaf, Member, Node, Parameter, Raster, Tree, walk
+from unshade.nodes import KINDS, Leaf, Member, Node, Parameter, Raster, Tree, carried_amplitude, walk
 from unshade.render import part, render
 from unshade.report_chart import Point, chart
 from unshade.serde import dumps, to_text
@@ -40,7 +40,7 @@ GAINS = (1, 2, 4, 8, 16, 32, 64)
 FINE, COARSE = 160, 80
 """Pixels of a thumbnail of the chosen tree, and of the others."""
 
-SLOTS = ("figures", "pictures", "tree", "leaves", "parts", "text")
+SLOTS = ("figures", "pictures", "about", "tree", "leaves", "parts", "text")
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,16 @@ class _Picture:
     """What every sheet is compared with."""
 
     image: torch.Tensor
-    counted: torch.Tensor
-    """(1, S, S) bool: the pixels that are scored."""
+    valid: torch.Tensor
+    """(1, S, S) bool: the pixels that are not ignored."""
+    scored: torch.Tensor
+    """(1, S, S) bool: those of them that count."""
     gain: int
 
     def difference(self, rendered: torch.Tensor) -> torch.Tensor:
-        """(4, S, S): the amplified absolute difference, transparent where nothing is compared."""
-        return torch.cat([(rendered - self.image).abs() * self.gain, self.counted.to(rendered.dtype)])
+        """(4, S, S): the amplified absolute difference where it is scored, transparent where the input is ignored."""
+        seen = self.valid | ~disc_mask(self.image.shape[-1])
+        return torch.cat([(rendered - self.image).abs() * self.gain * self.scored, seen.to(rendered.dtype)])
 
 
 def report_html(result: Result, sphere: SphereImage, source_name: str, figures: Mapping[str, Any]) -> str:
@@ -70,19 +73,20 @@ def report_html(result: Result, sphere: SphereImage, source_name: str, figures: 
     image = sphere.image.detach().float().cpu()
     size = image.shape[-1]
     rendered = render(result.tree, sphere_normals(size))
-    counted = disc_mask(size, SCORED_RADIUS) & sphere.valid.cpu()
-    picture = _Picture(image, counted, _gain(((rendered - image).abs() * counted)))
+    scored = disc_mask(size, SCORED_RADIUS) & sphere.valid.cpu()
+    picture = _Picture(image, sphere.valid.cpu(), scored, _gain((rendered - image).abs() * scored))
 
     keys = [f"tree-{index}" for index in range(len(family.members))]
     others = [f"other-{index}" for index in range(len(family.alternatives))]
     chosen = keys[family.chosen]
     members = dict(zip([*keys, *others], [*family.members, *family.alternatives], strict=True))
     members[chosen] = Member(result.tree, result.psnr)
-    sheets = {chosen: _sheet(chosen, members[chosen], picture, {"seed": result.seed, "preset": result.preset, **figures}, fine=True)}
+    shown = {"seed": result.seed, "preset": result.preset, **figures}
+    sheets = {chosen: _sheet(chosen, members[chosen], picture, "The chosen tree", shown, fine=True)}
     room = BUDGET - _length(sheets[chosen])
     for key in sorted(members, key=lambda key: (key in keys, abs(keys.index(key) - family.chosen) if key in keys else 0)):
         if key != chosen:
-            sheet = _sheet(key, members[key], picture, {})
+            sheet = _sheet(key, members[key], picture, _standing(key in others, members[key], result.tree), {})
             room -= _length(sheet)
             if room < 0:
                 break
@@ -102,8 +106,7 @@ def report_html(result: Result, sphere: SphereImage, source_name: str, figures: 
             "strip": "".join(_choice(key, members[key], key == chosen) for key in keys if key in sheets),
             "others": _others({key: members[key] for key in others if key in sheets}),
             "count": str(len(keys)),
-            "templates": "".join(_template(key, members[key], sheet) for key, sheet in sheets.items() if key != chosen),
-            "chosen_words": escape(_words(members[chosen])),
+            "templates": "".join(_template(key, sheet) for key, sheet in sheets.items() if key != chosen),
             "json": base64.b64encode(dumps(family).encode()).decode(),
             "file_name": escape(re.sub(r"[^\w.-]+", "_", source_name).rpartition(".")[0] or "tree") + ".tree.json",
             **{f"slot_{slot}": sheets[chosen][slot] for slot in SLOTS},
@@ -127,10 +130,17 @@ def _gain(difference: torch.Tensor) -> int:
 
 
 def _words(member: Member) -> str:
-    return f"{member.values} values, {number(member.psnr)} dB"
+    return f"{member.values} values, {labels.decibels(member.psnr)}"
 
 
-def _sheet(key: str, member: Member, picture: _Picture, figures: Mapping[str, Any], fine: bool = False) -> dict[str, str]:
+def _standing(other: bool, member: Member, chosen: Tree) -> str:
+    """What a tree is beside the chosen one."""
+    if other:
+        return "Another explanation"
+    return "A simpler tree" if member.values < chosen.values else "A larger tree" if member.values > chosen.values else "A tree of the same size"
+
+
+def _sheet(key: str, member: Member, picture: _Picture, standing: str, figures: Mapping[str, Any], fine: bool = False) -> dict[str, str]:
     """Everything on the page that belongs to one tree."""
     tree, size = member.tree, picture.image.shape[-1]
     rendered = render(tree, sphere_normals(size))
@@ -156,6 +166,7 @@ def _sheet(key: str, member: Member, picture: _Picture, figures: Mapping[str, An
             size,
             "difference",
         ),
+        "about": f"<h3>{standing}</h3><p>{escape(_words(member))}</p><p class=\"quiet\">{escape(labels.outline(tree))}</p>",
         "tree": drawn,
         "leaves": "".join(_cards(tree, key)),
         "parts": _parts(tree, 192 if fine else 128),
@@ -180,7 +191,7 @@ def _figures(figures: Mapping[str, Any]) -> str:
         if name in figures:
             value = figures[name]
             words, unit = known.get(name, (labels.kind_words(name), ""))
-            text = value if isinstance(value, str) else str(value) if isinstance(value, int) else f"{value:.1f}" if name == "psnr" and math.isfinite(value) else number(value)
+            text = value if isinstance(value, str) else str(value) if isinstance(value, int) else labels.decibels(value).split()[0] if name == "psnr" else number(value)
             parts.append(f'<div><dt>{escape(words)}</dt><dd>{escape(text)}<small>{unit}</small></dd></div>')
     return "".join(parts)
 
@@ -211,7 +222,7 @@ def _choice(key: str, member: Member, chosen: bool) -> str:
     return (
         f'<button type="button" class="choice" data-show="{key}" aria-pressed="{"true" if chosen else "false"}" title="{escape(labels.outline(member.tree))}">'
         f'<img class="disc" src="{data_uri(small, "webp-lossy", 80)}" width="64" height="64" alt="">'
-        f'<span class="amount">{member.values}<span class="unseen"> values</span></span><span class="quality">{number(member.psnr)} dB</span></button>'
+        f'<span class="amount">{member.values}<span class="unseen"> values</span></span><span class="quality">{labels.decibels(member.psnr)}</span></button>'
     )
 
 
@@ -222,12 +233,12 @@ def _others(members: Mapping[str, Member]) -> str:
     cards = "".join(
         f'<li>{_choice(key, member, False)}<p>{escape(labels.outline(member.tree))}</p></li>' for key, member in members.items()
     )
-    return f'<div class="others"><h3>Other explanations</h3><p class="quiet">A picture has several: trees of about the same size with another structure.</p><ul>{cards}</ul></div>'
+    return f'<div class="others"><h3>Other explanations</h3><p class="quiet">Trees of about the same size with another structure.</p><ul>{cards}</ul></div>'
 
 
-def _template(key: str, member: Member, sheet: Mapping[str, str]) -> str:
+def _template(key: str, sheet: Mapping[str, str]) -> str:
     slots = "".join(f'<div data-slot="{slot}">{sheet[slot]}</div>' for slot in SLOTS)
-    return f'<template data-sheet="{key}" data-words="{escape(_words(member))}">{slots}</template>\n'
+    return f'<template data-sheet="{key}">{slots}</template>\n'
 
 
 def _cards(tree: Tree, key: str) -> Iterator[str]:
@@ -250,7 +261,9 @@ def _card(tree: Tree, place: str, address: str, node: Node, leaf: Leaf, tint: Le
         node: the leaf, or the multiply of a tinted light.
     """
     rows = [_row("tint", _swatch(labels.shown_color(tint["color"], tree.blend_space)))] if tint else []  # type: ignore[arg-type]
-    rows += _lights(leaf, tree.blend_space) if leaf.lobes > 1 else [_row(p.name, _value(p, value, tree.blend_space), p.meaning) for p, value in labels.stored(leaf)]
+    carried = KINDS[leaf.kind].amplitude if carried_amplitude(node) else None
+    shown = [(parameter, value) for parameter, value in labels.stored(leaf) if parameter.name != carried]
+    rows += _lights(leaf, tree.blend_space) if leaf.lobes > 1 else [_row(p.name, _value(p, value, tree.blend_space), p.meaning) for p, value in shown]
     name = labels.label(node)
     kind = labels.kind_words(leaf.kind)
     said = f"tinted {kind}" if tint else kind

@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from unshade.labels import number
+from unshade.labels import decibels
 
-WIDTH, HEIGHT = 720.0, 300.0
-LEFT, RIGHT, TOP, BOTTOM = 52.0, 24.0, 22.0, 46.0
+WIDTH, HEIGHT = 720.0, 390.0
+LEFT, RIGHT, TOP, BOTTOM = 52.0, 24.0, 26.0, 62.0
 PERFECT = 80.0
 """A render without an error has no finite PSNR; it is drawn here, in dB."""
 
@@ -55,7 +55,7 @@ def chart(points: Sequence[Point]) -> str:
     for tick in ticks(low, high, 5):
         parts.append(f'<path class="grid" d="M{LEFT:g} {up(tick):.1f}H{WIDTH - RIGHT:g}"/><text x="{LEFT - 10:g}" y="{up(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>')
     for tick in ticks(0.0, widest, 8):
-        parts.append(f'<text x="{across(tick):.1f}" y="{HEIGHT - BOTTOM + 20:g}" text-anchor="middle">{tick:g}</text>')
+        parts.append(f'<text x="{across(tick):.1f}" y="{HEIGHT - BOTTOM + 24:g}" text-anchor="middle">{tick:g}</text>')
     parts.append(f'<text class="axis" x="{LEFT - 10:g}" y="12" text-anchor="end">dB</text>')
     parts.append(f'<text class="axis" x="{WIDTH - RIGHT:g}" y="{HEIGHT - 6:g}" text-anchor="end">values that the tree stores</text>')
     path = "L".join(f"{across(point.values):.1f} {up(point.psnr):.1f}" for point in points if not point.other)
@@ -65,7 +65,7 @@ def chart(points: Sequence[Point]) -> str:
 
 
 def _mark(point: Point, x: float, y: float) -> str:
-    words = f"{point.values} values, {number(point.psnr)} dB{', chosen' if point.chosen else ', an alternative' if point.other else ''}"
+    words = f"{point.values} values, {decibels(point.psnr)}{', chosen' if point.chosen else ', an alternative' if point.other else ''}"
     if not point.open:
         return f'<circle class="shut" cx="{x:.1f}" cy="{y:.1f}" r="2.5"><title>{words}</title></circle>'
     shape = f'<path class="dot" d="M{x:.1f} {y - 6:.1f}l6 6l-6 6l-6 -6z"/>' if point.other else f'<circle class="dot" cx="{x:.1f}" cy="{y:.1f}" r="5"/>'
