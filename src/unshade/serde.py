@@ -41,7 +41,7 @@ MAX_DOCUMENT_NODES = 20 * MAX_NODES
 MAX_BYTES = 2**29
 """Largest file that is read."""
 
-LINE = 120
+LINE = 160
 """A part of a document that fits a line of this length stands on one."""
 
 

@@ -252,11 +252,11 @@ class _Parser:
             if self.names_a_value and self.token == "name":
                 name = self.name(name)
             else:
-                named = self.names_a_value
+                column_of_argument, named = self.column, self.names_a_value
                 parameter = self.parameter(kind, by_place)
                 by_place = len(kind.parameters) + 1 if named else by_place + 1
                 if parameter.name in lobes[-1]:
-                    self.fault(f"{kind.name} has its {parameter.name} already")
+                    self.fault(f"{kind.name} has its {parameter.name} already", column_of_argument)
                 lobes[-1][parameter.name] = (self.column, self.value(kind, parameter))
             if not self.at(";"):
                 self.separator(kind.name)
