@@ -46,10 +46,10 @@ lint: $(VENV)/.dev
 	@$(BIN)/lint-imports --no-logo
 
 pytest: $(VENV)/.dev
-	@$(PY) -m pytest -q -n 2 --dist worksteal
+	@$(PY) -m pytest -n 2 --dist worksteal
 
 fast: $(VENV)/.dev
-	@$(PY) -m pytest -q -n 2 --dist worksteal -m 'not slow and not browser'
+	@$(PY) -m pytest -n 2 --dist worksteal -m 'not slow and not browser'
 
 bench: $(VENV)/.dev
 	@$(BIN)/unshade bench

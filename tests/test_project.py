@@ -88,6 +88,18 @@ def test_every_leaf_kind_and_parameter_is_in_the_format() -> None:
         assert f"`{name}" in page
 
 
+def test_the_trees_in_the_format_can_be_read() -> None:
+    from unshade.serde import dumps, loads
+
+    page = text_of("docs/tree-format.md")
+    document = re.findall(r"^```json\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0]
+    line = re.findall(r"^screen\(.*\)$", page, re.MULTILINE)[0]
+    for text in (document, line):
+        tree = loads(text)
+        assert loads(dumps(tree)) == tree
+        assert unshade.parse(str(tree)) == tree
+
+
 def test_every_preset_is_in_the_guide() -> None:
     from unshade.decompose import PRESETS
 
