@@ -16,7 +16,12 @@ WIDTH = 100
 
 def reference() -> str:
     """The whole page."""
-    commands = [("unshade", cli), *((f"unshade {name}", command) for name, command in sorted(cli.commands.items()))]
+    context = click.Context(cli)
+    commands: list[tuple[str, click.Command]] = [("unshade", cli)]
+    for name in sorted(cli.commands):
+        command = cli.resolve_command(context, [name])[1]
+        assert command is not None
+        commands.append((f"unshade {name}", command))
     return HEAD + "".join(f"\n## {path}\n\n```text\n{help_text(path, command)}\n```\n" for path, command in commands)
 
 

@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,8 +40,34 @@ Exit codes:
 SOME_FAILED, INTERRUPTED, PIPE_CLOSED = 7, 130, 141
 
 
+class PipeClosed(Exception):  # noqa: N818 - nobody's mistake
+    """The program that read standard output went away; click would take a BrokenPipeError for a general failure."""
+
+
+class Verbs(click.Group):
+    """Loads the benchmark's command only where it is run, since it comes with PyTorch."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """As click has it, but a closed pipe can be told apart."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError as error:
+            raise PipeClosed from error
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click has it."""
+        name, command, rest = super().resolve_command(ctx, args)
+        if command is bench:
+            from unshade.bench.command import command
+        return name, command, rest
+
+
 @click.group(
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}, epilog=EXIT_CODES, invoke_without_command=True
+    cls=Verbs,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog=EXIT_CODES,
+    invoke_without_command=True,
+    subcommand_metavar="COMMAND [ARGS]...",
 )
 @click.version_option(__version__, prog_name="unshade")
 @click.pass_context
@@ -366,13 +392,10 @@ def sample(output: Path | None, count: int, style: str, seed: int, size: int) ->
             artifacts.write_sample(tree, output, f"{number:0{len(str(count - 1))}d}", size)
 
 
-@cli.command(context_settings={"ignore_unknown_options": True, "help_option_names": []}, add_help_option=False)
-@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
-def bench(arguments: tuple[str, ...]) -> None:
-    """Measure data sets x methods and write the results; `unshade bench --help` says how."""
-    from unshade import bench
-
-    bench.main(list(arguments))
+@cli.command(add_help_option=False)
+def bench() -> None:
+    """Measure data sets x methods and write the results."""
+    raise AssertionError("`Verbs` puts the real command in the place of this one")
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -390,8 +413,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _fail(error.format_message(), error.exit_code)
     except (KeyboardInterrupt, click.Abort):
         return _fail("interrupted; what was done is kept", INTERRUPTED)
-    except BrokenPipeError:
-        # Python would complain once more when it flushes at its end.
+    except (PipeClosed, BrokenPipeError):
+        # Python would complain once more when it flushes at its end, so what is left goes nowhere.
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PIPE_CLOSED
