@@ -24,7 +24,11 @@ def lamp(name: str | None = None) -> Operator:
 
 
 def painted(space: str = "srgb") -> Tree:
-    paint = mix(leaf("albedo", color=(0.8, 0.2, 0.1), name="lacquer"), leaf("albedo", color=(0.1, 0.3, 0.7)), leaf("threshold", threshold=0.6, softness=0.2))
+    paint = mix(
+        leaf("albedo", color=(0.8, 0.2, 0.1), name="lacquer"),
+        leaf("albedo", color=(0.1, 0.3, 0.7)),
+        leaf("threshold", threshold=0.6, softness=0.2),
+    )
     return Tree(screen(multiply(paint, leaf("diffuse", direction=(1.0, 1.0, 1.0))), lamp("window"), leaf("rim")), space)  # type: ignore[arg-type]
 
 
@@ -147,7 +151,16 @@ def test_labels_say_what_a_person_looks_for() -> None:
     assert labels.direction((0.0, 0.0, 1.0)) == "⊙ 0°"
     assert labels.direction((0.0, -1.0, -1.0)) == "↓ 135°"
     assert labels.direction_words((-1.0, 1.0, 1.0)) == "55 degrees left up"
-    assert [labels.number(value) for value in (0.0413, 1.5, 120.0, 4820.4, -2.0, 0.0, 1e-9, float("inf"))] == ["0.0413", "1.5", "120", "4820", "−2", "0", "0", "∞"]
+    assert [labels.number(value) for value in (0.0413, 1.5, 120.0, 4820.4, -2.0, 0.0, 1e-9, float("inf"))] == [
+        "0.0413",
+        "1.5",
+        "120",
+        "4820",
+        "−2",
+        "0",
+        "0",
+        "∞",
+    ]
     assert labels.outline(painted()) == "2 albedos, diffuse, tinted highlight, rim, threshold mask"
     assert labels.key_values(leaf("image", pixels=Raster.from_array(torch.zeros(3, 4, 6)))) == ["6 × 4 pixels"]
     assert labels.shown_color((0.5, 0.5, 0.5), "linear") == "#bcbcbc"

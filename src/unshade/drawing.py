@@ -183,16 +183,17 @@ def tree_svg(
     places = {address: f"{prefix}-{index}" for index, (address, _) in enumerate(walk(tree.root))}
     root = _plan(tree.root, fold)
     width, height = _place(root)
+    area = f'width="{width:.0f}" height="{height:.0f}"'
+    about = f'viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(title)}"'
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" class="shade-tree" width="{width:.0f}" height="{height:.0f}" '
-        f'viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(title)}">',
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="shade-tree" {area} {about}>',
         f"<style>{STYLE}</style><defs>" if standalone else "<defs>",
         f'<clipPath id="{prefix}-disc" clipPathUnits="userSpaceOnUse"><circle cx="0.5" cy="0.5" r="0.5"/></clipPath>',
         *_symbols(tree, places, prefix, thumbnail, encoding, quality),
         "</defs>",
     ]
     if standalone:
-        parts.append(f'<rect class="paper" width="{width:.0f}" height="{height:.0f}" rx="10" fill="#ffffff"/>')
+        parts.append(f'<rect class="paper" {area} rx="10" fill="#ffffff"/>')
     boxes = list(_boxes(root))
     parts += [_edges(box) for box in boxes if box.below]
     parts += [_drawn(box, tree, places) for box in boxes]
@@ -243,9 +244,10 @@ def _edges(box: _Box) -> str:
 
 def _disc(place: str, x: float, y: float, size: float) -> str:
     """A node's picture as a disc whose middle is at x and top at y."""
+    middle = f'cx="{x:.1f}" cy="{y + size / 2:.1f}" r="{size / 2 - 0.5:g}"'
     return (
         f'<use href="#{place}" x="{x - size / 2:.1f}" y="{y:.1f}" width="{size:g}" height="{size:g}"/>'
-        f'<circle class="ring" cx="{x:.1f}" cy="{y + size / 2:.1f}" r="{size / 2 - 0.5:g}" fill="none" stroke="#000000" stroke-opacity=".14"/>'
+        f'<circle class="ring" {middle} fill="none" stroke="#000000" stroke-opacity=".14"/>'
     )
 
 
@@ -256,21 +258,28 @@ def _text(kind: str, x: float, y: float, words: str) -> str:
 
 
 def _drawn(box: _Box, tree: Tree, places: dict[str, str]) -> str:
+    """A node with its sign, its mask or its words."""
     node, x = box.node, box.x
     name = f"{box.address} “{node.name}”" if node.name else box.address
-    parts = [f'<g class="node" data-address="{escape(box.address)}"><title>{escape(name)}</title>', _disc(places[box.address], x, box.y, THUMB)]
+    parts = [
+        f'<g class="node" data-address="{escape(box.address)}"><title>{escape(name)}</title>',
+        _disc(places[box.address], x, box.y, THUMB),
+    ]
     base = box.y + THUMB
     if box.below:
         words = f"{node.name} · {SIGNS[node.kind]}" if node.name else SIGNS[node.kind]
         half = 11.0 if words == "×" else min(len(words), 17) * 3.1 + 9.0
-        parts.append(f'<rect class="pill" x="{x - half:.1f}" y="{base + 7:.1f}" width="{2 * half:.1f}" height="20" rx="10" fill="#ecebe7"/>')
+        parts.append(
+            f'<rect class="pill" x="{x - half:.1f}" y="{base + 7:.1f}" width="{2 * half:.1f}" height="20" rx="10" fill="#ecebe7"/>'
+        )
         parts.append(_text("sign", x, base + 21, words))
     if box.mask and isinstance(node, Operator) and node.mask is not None:
         side = x + THUMB / 2 + 12.0 + SMALL
         parts.append(f'<path class="edge to-mask" d="M{x + THUMB / 2:.1f} {box.y + 32:.1f}H{side - SMALL:.1f}" stroke="#b9b9b4"/>')
         lines = [node.mask.name or "mask", *key_values(node.mask, lines=2)]
         about = f"{box.mask}: {node.mask.kind}, {', '.join(key_values(node.mask))}"
-        parts.append(f'<g class="node" data-address="{escape(box.mask)}"><title>{escape(about)}</title>{_disc(places[box.mask], side, box.y + 32 - SMALL, 2 * SMALL)}')
+        parts.append(f'<g class="node" data-address="{escape(box.mask)}"><title>{escape(about)}</title>')
+        parts.append(_disc(places[box.mask], side, box.y + 32 - SMALL, 2 * SMALL))
         parts += [_text("name" if k == 0 else "value", side, box.y + 32 + SMALL + LINE * (k + 1), line) for k, line in enumerate(lines)]
         parts.append("</g>")
     if not box.below:
@@ -287,7 +296,10 @@ def _leaf_words(box: _Box, tree: Tree, places: dict[str, str], base: float) -> s
         pair = folds(box.node)
         assert pair is not None
         shown = pair[1]
-        parts.append(_disc(places[box.pair[0]], box.x - SMALL * 0.85, base + 6, SMALL) + _disc(places[box.pair[1]], box.x + SMALL * 0.85, base + 6, SMALL))
+        parts.append(
+            _disc(places[box.pair[0]], box.x - SMALL * 0.85, base + 6, SMALL)
+            + _disc(places[box.pair[1]], box.x + SMALL * 0.85, base + 6, SMALL)
+        )
         parts.append(_text("sign", box.x, base + 21, "×"))
         base += SMALL + 6
         lines = [shown_color(pair[0]["color"], tree.blend_space)]  # type: ignore[arg-type]

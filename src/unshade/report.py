@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +19,9 @@ import torch
 from unshade import labels
 from unshade.drawing import STYLE, data_uri, tree_svg
 from unshade.labels import escape, number
-from unshade.nodes import KINDS, Leaf, Member, Node, Parameter, Raster, Tree, carried_amplitude, walk
+from unshade.nodes import Member, Tree
 from unshade.render import part, render
+from unshade.report_cards import cards
 from unshade.report_chart import Point, chart
 from unshade.serde import dumps, to_text
 from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
@@ -137,14 +136,25 @@ def _standing(other: bool, member: Member, chosen: Tree) -> str:
     """What a tree is beside the chosen one."""
     if other:
         return "Another explanation"
-    return "A simpler tree" if member.values < chosen.values else "A larger tree" if member.values > chosen.values else "A tree of the same size"
+    return (
+        "A simpler tree"
+        if member.values < chosen.values
+        else "A larger tree"
+        if member.values > chosen.values
+        else "A tree of the same size"
+    )
 
 
 def _sheet(key: str, member: Member, picture: _Picture, standing: str, figures: Mapping[str, Any], fine: bool = False) -> dict[str, str]:
     """Everything on the page that belongs to one tree."""
     tree, size = member.tree, picture.image.shape[-1]
     rendered = render(tree, sphere_normals(size))
-    shown = {"psnr": member.psnr, "values": tree.values, "leaves": tree.leaves, **{name: value for name, value in figures.items() if value is not None}}
+    shown = {
+        "psnr": member.psnr,
+        "values": tree.values,
+        "leaves": tree.leaves,
+        **{name: value for name, value in figures.items() if value is not None},
+    }
     encoding = "webp" if fine else "webp-lossy"
     drawn = tree_svg(
         tree,
@@ -157,7 +167,14 @@ def _sheet(key: str, member: Member, picture: _Picture, standing: str, figures: 
     )
     return {
         "figures": _figures(shown),
-        "pictures": _figure("Render", f"the tree’s {tree.values} values", data_uri(rendered, encoding), f"Render of the tree, {_words(member)}", size, "render")
+        "pictures": _figure(
+            "Render",
+            f"the tree’s {tree.values} values",
+            data_uri(rendered, encoding),
+            f"Render of the tree, {_words(member)}",
+            size,
+            "render",
+        )
         + _figure(
             "Difference",
             f"absolute, {picture.gain} × brighter" if picture.gain > 1 else "absolute",
@@ -166,9 +183,9 @@ def _sheet(key: str, member: Member, picture: _Picture, standing: str, figures: 
             size,
             "difference",
         ),
-        "about": f"<h3>{standing}</h3><p>{escape(_words(member))}</p><p class=\"quiet\">{escape(labels.outline(tree))}</p>",
+        "about": f'<h3>{standing}</h3><p>{escape(_words(member))}</p><p class="quiet">{escape(labels.outline(tree))}</p>',
         "tree": drawn,
-        "leaves": "".join(_cards(tree, key)),
+        "leaves": "".join(cards(tree, key)),
         "parts": _parts(tree, 192 if fine else 128),
         "text": escape(to_text(tree)),
     }
@@ -191,8 +208,16 @@ def _figures(figures: Mapping[str, Any]) -> str:
         if name in figures:
             value = figures[name]
             words, unit = known.get(name, (labels.kind_words(name), ""))
-            text = value if isinstance(value, str) else str(value) if isinstance(value, int) else labels.decibels(value).split()[0] if name == "psnr" else number(value)
-            parts.append(f'<div><dt>{escape(words)}</dt><dd>{escape(text)}<small>{unit}</small></dd></div>')
+            text = (
+                value
+                if isinstance(value, str)
+                else str(value)
+                if isinstance(value, int)
+                else labels.decibels(value).split()[0]
+                if name == "psnr"
+                else number(value)
+            )
+            parts.append(f"<div><dt>{escape(words)}</dt><dd>{escape(text)}<small>{unit}</small></dd></div>")
     return "".join(parts)
 
 
@@ -219,10 +244,12 @@ def _parts(tree: Tree, size: int) -> str:
 def _choice(key: str, member: Member, chosen: bool) -> str:
     """A button of the strip of renders."""
     small = render(member.tree, sphere_normals(64))
+    state = f'aria-pressed="{"true" if chosen else "false"}" title="{escape(labels.outline(member.tree))}"'
     return (
-        f'<button type="button" class="choice" data-show="{key}" aria-pressed="{"true" if chosen else "false"}" title="{escape(labels.outline(member.tree))}">'
+        f'<button type="button" class="choice" data-show="{key}" {state}>'
         f'<img class="disc" src="{data_uri(small, "webp-lossy", 80)}" width="64" height="64" alt="">'
-        f'<span class="amount">{member.values}<span class="unseen"> values</span></span><span class="quality">{labels.decibels(member.psnr)}</span></button>'
+        f'<span class="amount">{member.values}<span class="unseen"> values</span></span>'
+        f'<span class="quality">{labels.decibels(member.psnr)}</span></button>'
     )
 
 
@@ -231,114 +258,12 @@ def _others(members: Mapping[str, Member]) -> str:
     if not members:
         return ""
     cards = "".join(
-        f'<li>{_choice(key, member, False)}<p>{escape(labels.outline(member.tree))}</p></li>' for key, member in members.items()
+        f"<li>{_choice(key, member, False)}<p>{escape(labels.outline(member.tree))}</p></li>" for key, member in members.items()
     )
-    return f'<div class="others"><h3>Other explanations</h3><p class="quiet">Trees of about the same size with another structure.</p><ul>{cards}</ul></div>'
+    words = "Trees of about the same size with another structure."
+    return f'<div class="others"><h3>Other explanations</h3><p class="quiet">{words}</p><ul>{cards}</ul></div>'
 
 
 def _template(key: str, sheet: Mapping[str, str]) -> str:
     slots = "".join(f'<div data-slot="{slot}">{sheet[slot]}</div>' for slot in SLOTS)
     return f'<template data-sheet="{key}">{slots}</template>\n'
-
-
-def _cards(tree: Tree, key: str) -> Iterator[str]:
-    """One card a leaf; a light with its own albedo shares one."""
-    hidden: set[int] = set()
-    for index, (address, node) in enumerate(walk(tree.root)):
-        pair = labels.folds(node)
-        if pair:
-            hidden |= {index + 1, index + 2}
-            yield _card(tree, f"{key}-{index}", address, node, pair[1], pair[0])
-        elif isinstance(node, Leaf) and index not in hidden:
-            yield _card(tree, f"{key}-{index}", address, node, node)
-
-
-def _card(tree: Tree, place: str, address: str, node: Node, leaf: Leaf, tint: Leaf | None = None) -> str:
-    """A leaf with its picture, name, address, role and every value.
-
-    Args:
-        place: id of the symbol with the node's picture in the drawn tree.
-        node: the leaf, or the multiply of a tinted light.
-    """
-    rows = [_row("tint", _swatch(labels.shown_color(tint["color"], tree.blend_space)))] if tint else []  # type: ignore[arg-type]
-    carried = KINDS[leaf.kind].amplitude if carried_amplitude(node) else None
-    shown = [(parameter, value) for parameter, value in labels.stored(leaf) if parameter.name != carried]
-    rows += _lights(leaf, tree.blend_space) if leaf.lobes > 1 else [_row(p.name, _value(p, value, tree.blend_space), p.meaning) for p, value in shown]
-    name = labels.label(node)
-    kind = labels.kind_words(leaf.kind)
-    said = f"tinted {kind}" if tint else kind
-    return (
-        f'<li class="card" data-address="{escape(address)}">'
-        f'<svg class="portrait" viewBox="0 0 1 1" aria-hidden="true"><use href="#{place}"/></svg>'
-        f'<div><h3>{escape(name)}{f" <small>{escape(said)}</small>" if name != said else ""}</h3>'
-        f'<p class="about"><span class="role role-{leaf.role.value}">{leaf.role.value}</span> <code>{escape(address)}</code></p>'
-        f"<dl>{''.join(rows)}</dl></div></li>\n"
-    )
-
-
-def _row(name: str, value: str, meaning: str = "") -> str:
-    return f'<div><dt{f""" title="{escape(meaning)}" """ if meaning else ""}>{escape(labels.kind_words(name))}</dt><dd>{value}</dd></div>'
-
-
-def _value(parameter: Parameter, value: Sequence[float] | Raster, space: str) -> str:
-    """A parameter's value as a picture and in words."""
-    if isinstance(value, Raster):
-        stored = value.channels * value.height * value.width
-        picture = data_uri(value.tensor(), "webp-lossy")
-        return f'<img class="raster" src="{picture}" alt="" width="{value.width}" height="{value.height}"> <span>{value.width} × {value.height}, {stored} values</span>'
-    if parameter.type == "color":
-        return _swatch(labels.shown_color(value, space))
-    if parameter.type == "direction":
-        return f'{_dial([(tuple(value), "")])}<span>{labels.direction(value)}</span>'
-    if parameter.type == "rotation":
-        return f"<span>{', '.join(number(part) for part in value)} {escape(parameter.unit)}</span>"
-    return _bar(parameter, value[0])
-
-
-def _bar(parameter: Parameter, value: float) -> str:
-    """A number on the bar of its range."""
-    low, high = parameter.low, parameter.high
-    if parameter.logarithmic:
-        share = math.log(value / low) / math.log(high / low)
-    else:
-        share = (value - low) / (high - low) if high > low else 0.0
-    said = f"{number(low)} to {number(high)}{', logarithmic' if parameter.logarithmic else ''}"
-    return (
-        f'<span class="bar" title="{said}" style="--at:{100 * min(max(share, 0.0), 1.0):.1f}%"></span>'
-        f'<span class="number" title="{value!r}">{number(value)}</span>'
-    )
-
-
-def _swatch(color: str) -> str:
-    return f'<span class="swatch" style="--color:{color}"></span><code>{color}</code>'
-
-
-def _dial(lights: Sequence[tuple[tuple[float, ...], str]]) -> str:
-    """Directions as dots on a small sphere seen from the front; a hollow dot is on its far side."""
-    dots = []
-    for (x, y, z), color in lights:
-        fill = f' style="--color:{color}"' if color else ""
-        dots.append(f'<circle class="{"near" if z >= 0 else "far"}" cx="{19 + 16 * x:.1f}" cy="{19 - 16 * y:.1f}" r="3"{fill}/>')
-    words = "; ".join(labels.direction_words(vector) for vector, _ in lights)
-    return (
-        f'<svg class="dial" viewBox="0 0 38 38" width="38" height="38" role="img" aria-label="{words}"><title>{words}</title>'
-        f'<circle class="globe" cx="19" cy="19" r="16"/><path class="axes" d="M3 19H35M19 3V35"/>{"".join(dots)}</svg>'
-    )
-
-
-def _lights(leaf: Leaf, space: str) -> list[str]:
-    """The lobes of an environment: all on one sphere, then each with its numbers."""
-    stored = {parameter.name: labels.entries(parameter, value) for parameter, value in labels.stored(leaf) if not isinstance(value, Raster)}
-    parameters = {parameter.name: parameter for parameter in KINDS[leaf.kind].parameters}
-    directions = next((stored[name] for name in stored if parameters[name].type == "direction"), [])
-    colors = next((stored[name] for name in stored if parameters[name].type == "color"), [(1.0, 1.0, 1.0)] * leaf.lobes)
-    rows = [_row(f"{leaf.lobes} lights", _dial([(at, labels.shown_color(color, space)) for at, color in zip(directions, colors, strict=False)]))]
-    for index in range(leaf.lobes):
-        words = []
-        for name, entries in stored.items():
-            entry = entries[index]
-            kind = parameters[name].type
-            shown = labels.direction(entry) if kind == "direction" else _swatch(labels.shown_color(entry, space)) if kind == "color" else f"{name} {number(entry[0])}"
-            words.append(f"<span>{shown}</span>")
-        rows.append(_row(f"light {index + 1}", "".join(words)))
-    return rows

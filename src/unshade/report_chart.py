@@ -51,9 +51,12 @@ def chart(points: Sequence[Point]) -> str:
     def up(psnr: float) -> float:
         return HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * (min(psnr, PERFECT) - low) / (high - low)
 
-    parts = [f'<svg class="chart" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="radiogroup" aria-label="Trees of the family by size and closeness">']
+    parts = [
+        f'<svg class="chart" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="radiogroup" aria-label="Trees of the family by size and closeness">'
+    ]
     for tick in ticks(low, high, 5):
-        parts.append(f'<path class="grid" d="M{LEFT:g} {up(tick):.1f}H{WIDTH - RIGHT:g}"/><text x="{LEFT - 10:g}" y="{up(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>')
+        parts.append(f'<path class="grid" d="M{LEFT:g} {up(tick):.1f}H{WIDTH - RIGHT:g}"/>')
+        parts.append(f'<text x="{LEFT - 10:g}" y="{up(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>')
     for tick in ticks(0.0, widest, 8):
         parts.append(f'<text x="{across(tick):.1f}" y="{HEIGHT - BOTTOM + 24:g}" text-anchor="middle">{tick:g}</text>')
     parts.append(f'<text class="axis" x="{LEFT - 10:g}" y="12" text-anchor="end">dB</text>')
@@ -68,9 +71,10 @@ def _mark(point: Point, x: float, y: float) -> str:
     words = f"{point.values} values, {decibels(point.psnr)}{', chosen' if point.chosen else ', an alternative' if point.other else ''}"
     if not point.open:
         return f'<circle class="shut" cx="{x:.1f}" cy="{y:.1f}" r="2.5"><title>{words}</title></circle>'
-    shape = f'<path class="dot" d="M{x:.1f} {y - 6:.1f}l6 6l-6 6l-6 -6z"/>' if point.other else f'<circle class="dot" cx="{x:.1f}" cy="{y:.1f}" r="5"/>'
-    halo = f'<circle class="halo" cx="{x:.1f}" cy="{y:.1f}" r="10"/>'
+    place = f'cx="{x:.1f}" cy="{y:.1f}"'
+    shape = f'<path class="dot" d="M{x:.1f} {y - 6:.1f}l6 6l-6 6l-6 -6z"/>' if point.other else f'<circle class="dot" {place} r="5"/>'
+    state = f'aria-checked="{"true" if point.chosen else "false"}" tabindex="{0 if point.chosen else -1}"'
     return (
-        f'<g class="point" role="radio" data-show="{point.key}" aria-checked="{"true" if point.chosen else "false"}" aria-label="{words}" '
-        f'tabindex="{0 if point.chosen else -1}"><title>{words}</title><circle class="reach" cx="{x:.1f}" cy="{y:.1f}" r="14"/>{halo}{shape}</g>'
+        f'<g class="point" role="radio" data-show="{point.key}" {state} aria-label="{words}"><title>{words}</title>'
+        f'<circle class="reach" {place} r="14"/><circle class="halo" {place} r="10"/>{shape}</g>'
     )
