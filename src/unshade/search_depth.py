@@ -15,7 +15,7 @@ structures of a depth come first, and the next depth grows from them. Without a 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
@@ -151,8 +151,12 @@ class Levels:
         if not self._deepest:
             found = self._new(self._leaves)
         else:
-            families = [self._new(grow([parent], [*self._below, *self._deepest[place + 1 :]])) for place, parent in enumerate(self._deepest)]
-            placed = [(place + position, place, structure) for place, family in enumerate(families) for position, structure in enumerate(family)]
+            families = [
+                self._new(grow([parent], [*self._below, *self._deepest[place + 1 :]])) for place, parent in enumerate(self._deepest)
+            ]
+            placed = [
+                (place + position, place, structure) for place, family in enumerate(families) for position, structure in enumerate(family)
+            ]
             found = [structure for _, _, structure in sorted(placed, key=lambda entry: entry[:2])]
         self._below, self._deepest = [*self._below, *self._deepest], found
         return found
@@ -206,7 +210,9 @@ def search(
     done = total = 0
     for depth in range(1, max_depth + 1):
         level = levels.next()
-        candidates = [structure for structure in level if _fits_picture(structure, colored) and (max_values is None or size(structure) <= max_values)]
+        candidates = [
+            structure for structure in level if _fits_picture(structure, colored) and (max_values is None or size(structure) <= max_values)
+        ]
         candidates = candidates[: budget.ranked]
         starts = {structure: as_tree(structure) for structure in candidates}
         promise: dict[Structure, float] = dict.fromkeys(candidates, 0.0)

@@ -89,4 +89,11 @@ def _strategy(mean: np.ndarray, directions: np.ndarray, seed: int, population: i
     reach = np.where(directions, DIRECTION_REACH, 1.0)
     bounds = np.stack([np.where(directions, -reach, 0.0), reach], axis=1)
     # One draw, then clipped: with tens of coordinates nearly every draw leaves the box somewhere, and drawing again costs time for nothing.
-    return CMA(mean=np.clip(mean, bounds[:, 0], bounds[:, 1]), sigma=SPREAD, bounds=bounds, n_max_resampling=1, seed=seed, population_size=population)
+    return CMA(
+        mean=np.clip(mean, bounds[:, 0], bounds[:, 1]),
+        sigma=SPREAD,
+        bounds=bounds,
+        n_max_resampling=1,
+        seed=seed,
+        population_size=population,
+    )

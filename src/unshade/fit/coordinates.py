@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 
 from unshade.errors import AddressError
-from unshade.nodes import KINDS, Leaf, Node, Role, find, find_address, walk
+from unshade.nodes import KINDS, Leaf, Node, Role, find_address, walk
 from unshade.parameters import Layout
 from unshade.sphere import VIEW
 from unshade.types import Params
@@ -26,7 +26,9 @@ def locked_numbers(root: Node, layout: Layout, locked: Collection[str]) -> torch
     Raises AddressError.
     """
     prefixes = [_prefix(root, where) for where in locked]
-    return torch.tensor([any(name == prefix or name.startswith(f"{prefix}.") for prefix in prefixes) for name in layout.names], dtype=torch.bool)
+    return torch.tensor(
+        [any(name == prefix or name.startswith(f"{prefix}.") for prefix in prefixes) for name in layout.names], dtype=torch.bool
+    )
 
 
 def _prefix(root: Node, where: str) -> str:
@@ -72,7 +74,10 @@ class Coordinates:
         """Low end and width of each free number's range, (D,) each, logarithms where the third is true."""
         lower, upper = self.layout.lower[self.free], self.layout.upper[self.free]
         logarithmic = self.layout.logarithmic[self.free] & (lower > 0)
-        low, high = torch.where(logarithmic, lower.clamp(min=1e-30).log(), lower), torch.where(logarithmic, upper.clamp(min=1e-30).log(), upper)
+        low, high = (
+            torch.where(logarithmic, lower.clamp(min=1e-30).log(), lower),
+            torch.where(logarithmic, upper.clamp(min=1e-30).log(), upper),
+        )
         straight = self.directions
         return low.masked_fill(straight, 0.0), (high - low).masked_fill(straight, 1.0), logarithmic
 
@@ -144,7 +149,10 @@ def _random_leaf(leaf: Leaf, generator: torch.Generator, count: int) -> torch.Te
                 if parameter.logarithmic:
                     value = middle / 30.0 * 150.0**uniform
                 else:
-                    value = middle + (uniform - 0.5) * min(parameter.high - parameter.low, 2.0) * 0.5
+                    # Away from both ends of its range, where an edge is hard or a spot is gone and no gradient leads back.
+                    reach = 0.25 * min(parameter.high - parameter.low, 2.0)
+                    low, high = (middle - reach).clamp(min=parameter.low), (middle + reach).clamp(max=parameter.high)
+                    value = low + (high - low) * (0.1 + 0.8 * uniform)
                 drawn.append(value.clamp(parameter.low, parameter.high))
     return torch.cat(drawn, dim=-1) if drawn else torch.zeros(count, 0, dtype=torch.float64)
 

@@ -1,0 +1,55 @@
+"""Rows that are done, one JSON object a line, so that a benchmark can be stopped and go on.
+
+A row is found again by what was asked (set, picture, method, seed, measures), not by the code that answered: after a
+change of the code, ask for a fresh run. The journal holds trees, so it stays out of the repository as the sheets do.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from unshade.errors import OutputError
+
+Row = dict[str, Any]
+
+KEY = ("dataset", "name", "method", "seed", "perceptual")
+
+
+def key_of(row: Row) -> tuple[Any, ...]:
+    """What was asked."""
+    return tuple(row[field] for field in KEY)
+
+
+class Journal:
+    """The file of rows; the last row of a key counts."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows: dict[tuple[Any, ...], Row] = {}
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Ended by a power cut or a kill, the last line may be half a row.
+            text = path.read_text(encoding="utf-8") if path.exists() else ""
+            path.write_text(text, encoding="utf-8") if not text or text.endswith("\n") else path.write_text(text + "\n", encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
+        for line in text.splitlines():
+            row = _parse(line)
+            if row is not None:
+                self.rows[key_of(row)] = row
+
+    def add(self, row: Row) -> None:
+        """Keep a row, at once."""
+        self.rows[key_of(row)] = row
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+
+def _parse(line: str) -> Row | None:
+    try:
+        row = json.loads(line)
+    except json.JSONDecodeError:
+        return None
+    return row if isinstance(row, dict) and all(field in row for field in KEY) else None
