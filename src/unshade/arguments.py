@@ -78,14 +78,16 @@ def read_document(source: str, text_only: bool = False) -> tuple[Tree, Family | 
             raise TreeError(f"expected a tree file, a folder with a {TREE_FILE}, or a tree's text such as albedo(#cc2030)")
         return tree, serde.loads_family(text) if re.search(r'"family"\s*:', text) else None
     except TreeError as error:
-        raise _named(error, "standard input" if source == "-" else str(path or source)) from error
+        if source == "-" or path is not None or "(" not in source:
+            raise _named(error, "standard input" if source == "-" else str(path or source)) from error
+        raise
 
 
 def _named(error: TreeError, source: str) -> TreeError:
-    """The error with the name of what was read, where it does not say so; a tree's text is shown by the error itself."""
-    message = str(error)
-    named = message if source in message or "(" in source else f"{source}: {message}"
-    renamed = TreeError(named)
+    """The error in one line that says what was read; the place in a line of text is shown only for text that was typed."""
+    message = str(error).partition("\n")[0]
+    source = source if len(source) <= 200 else f"{source[:200]}..."
+    renamed = TreeError(message if source in message else f"{source}: {message}")
     renamed.address = error.address
     return renamed
 

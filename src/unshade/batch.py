@@ -210,9 +210,9 @@ def decompose_picture(job: Job, on_step: Callable[[Step], None] | None = None) -
 
 def _decompose_picture(job: Job, on_step: Callable[[Step], None] | None) -> Record:
     limit_threads()
+    begin, settings, sphere = time.perf_counter(), job.settings, _read(job)
     from unshade.decompose import decompose
 
-    begin, settings, sphere = time.perf_counter(), job.settings, _read(job)
     decomposition = decompose(
         sphere,
         preset=settings.preset,
@@ -230,9 +230,9 @@ def _decompose_picture(job: Job, on_step: Callable[[Step], None] | None) -> Reco
 def fit_picture(job: Job, tree: Tree, locked: Sequence[str]) -> Record:
     """Read a picture, fit the parameters of a given tree to it, and write the result. Raises UnshadeError."""
     limit_threads()
+    begin, sphere = time.perf_counter(), _read(job)
     from unshade.decompose import fit
 
-    begin, sphere = time.perf_counter(), _read(job)
     return _written(job, fit(sphere, tree, locked=locked, seed=job.settings.seed), sphere, begin)
 
 
