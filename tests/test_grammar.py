@@ -9,8 +9,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import MASKS, leaves, nodes
 
+from strategies import MASKS, leaves, nodes
 from unshade.canonical import complement, constant
 from unshade.errors import TreeError
 from unshade.grammar import (
@@ -30,7 +30,7 @@ from unshade.sampler import STYLES, VISIBLE, cut_radius, every_leaf_shows
 from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
 from unshade.text import parse
 
-NORMALS = sphere_normals(24, dtype=torch.float64)
+NORMALS = sphere_normals(16, dtype=torch.float64)
 # The canonical form holds on any normals, also those that face away from the viewer.
 EVERYWHERE = torch.cat([NORMALS, -NORMALS], dim=-1)
 
@@ -47,13 +47,13 @@ def difference(a: Node, b: Node) -> float:
 
 
 @given(nodes())
-@settings(max_examples=150)
+@settings(max_examples=80)
 def test_canonical_renders_the_same(node: Node) -> None:
     assert difference(node, canonical(node)) <= 1e-5
 
 
 @given(nodes(named=False))
-@settings(max_examples=60)
+@settings(max_examples=40)
 def test_canonical_is_its_own_canonical_form(node: Node) -> None:
     once = canonical(node)
     twice = canonical(once)
@@ -62,7 +62,7 @@ def test_canonical_is_its_own_canonical_form(node: Node) -> None:
 
 
 @given(nodes(), st.randoms(use_true_random=False))
-@settings(max_examples=60)
+@settings(max_examples=40)
 def test_order_names_and_nesting_do_not_matter(node: Node, random: object) -> None:
     shuffled = _shuffled(node, random)
     assert difference(node, shuffled) <= 1e-5
@@ -92,7 +92,7 @@ def test_the_complement_of_a_mask_is_one_minus_it(mask: Leaf) -> None:
 
 
 @given(leaves((*KINDS,)))
-@settings(max_examples=150)
+@settings(max_examples=80)
 def test_a_leaf_that_is_called_constant_is(node: Leaf) -> None:
     color = constant(node)
     if color is not None:

@@ -18,9 +18,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image as PILImage
-from strategies import families, rasters, trees
 
 import unshade.files
+from strategies import families, rasters, trees
 from unshade.errors import OutputError, TreeError, TreeSyntaxError
 from unshade.nodes import KINDS, MAX_DEPTH, MAX_NODES, Kind, Leaf, Operator, Parameter, Raster, Role, Tree, leaf, multiply, register, screen
 from unshade.png import PngError, read_png, write_png
