@@ -79,7 +79,7 @@ def _sampled(case: Case, seed: int) -> Subject:
     from unshade.grammar import sample
 
     generator = torch.Generator().manual_seed(1_000_003 * seed + case.number)
-    tree = sample(generator, case.dataset.partition(":")[2])  # type: ignore[arg-type]
+    tree = sample(generator, case.dataset.partition(":")[2])
     picture = (render(tree, sphere_normals(SIZE)) * 255.0).round() / 255.0
     half = SIZE / 2
     sphere = SphereImage(picture, disc_mask(SIZE), Disc(half, half, half, 1.0))

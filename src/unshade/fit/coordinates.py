@@ -121,7 +121,7 @@ class Coordinates:
     def _leaves(self) -> list[Leaf]:
         """The leaves in the order of the layout."""
         nodes = dict(walk(self.root))
-        found = []
+        found: list[str] = []
         for name in self.layout.names:
             address = next(part for part in _parents(name) if part in nodes)
             if not found or found[-1] != address:
