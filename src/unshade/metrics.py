@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 
 from unshade.models import perceptual
 from unshade.sphere import SCORED_RADIUS, disc_mask
@@ -76,9 +75,10 @@ def ssim(a: Image, b: Image, mask: Mask | None = None) -> float:
     steps = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=a.dtype, device=a.device)
     taps = torch.exp(-0.5 * (steps / WINDOW_SIGMA).square())
     taps = taps / taps.sum()
-    blurred = torch.stack([a, b, a * a, b * b, a * b]).flatten(0, 1)[:, None]
-    blurred = F.conv2d(F.conv2d(blurred, taps.view(1, 1, -1, 1)), taps.view(1, 1, 1, -1))
-    mean_a, mean_b, square_a, square_b, product = blurred[:, 0].unflatten(0, (5, 3))
+    # The window as a banded matrix: float64 convolutions are four times slower.
+    window = torch.stack([torch.diag(tap.expand(a.shape[-1] - k), k) for k, tap in enumerate(taps)]).sum(0)[: 1 - len(taps)]
+    blurred = window @ torch.stack([a, b, a * a, b * b, a * b]) @ window.T
+    mean_a, mean_b, square_a, square_b, product = blurred
     variance_a, variance_b, covariance = square_a - mean_a**2, square_b - mean_b**2, product - mean_a * mean_b
     c1, c2 = 0.01**2, 0.03**2
     index = (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (variance_a + variance_b + c2))
