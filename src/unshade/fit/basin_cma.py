@@ -94,6 +94,6 @@ def _strategy(mean: np.ndarray, directions: np.ndarray, seed: int, population: i
         sigma=SPREAD,
         bounds=bounds,
         n_max_resampling=1,
-        seed=seed,
+        seed=seed % 2**32,
         population_size=population,
     )

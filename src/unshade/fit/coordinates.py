@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -60,16 +61,17 @@ class Coordinates:
         layout = Layout.of(root)
         return Coordinates(root, layout, layout.free & ~locked_numbers(root, layout, locked), layout.pack(root))
 
-    @property
+    @cached_property
     def size(self) -> int:
         """D."""
         return int(self.free.sum())
 
-    @property
+    @cached_property
     def directions(self) -> torch.Tensor:
         """(D,) bool, the coordinates that come in threes of length 1."""
         return torch.tensor([name == "direction" for name in self.layout.types], dtype=torch.bool)[self.free]
 
+    @cached_property
     def _scale(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Low end and width of each free number's range, (D,) each, logarithms where the third is true."""
         lower, upper = self.layout.lower[self.free], self.layout.upper[self.free]
@@ -83,14 +85,14 @@ class Coordinates:
 
     def encode(self, numbers: Params) -> torch.Tensor:
         """(*, P) numbers of the layout -> (*, D) points."""
-        low, width, logarithmic = (part.to(numbers.device) for part in self._scale())
+        low, width, logarithmic = (part.to(numbers.device) for part in self._scale)
         numbers = numbers[..., self.free.to(numbers.device)]
         scaled = torch.where(logarithmic, numbers.clamp(min=1e-30).log(), numbers)
         return (scaled - low.to(numbers)) / width.to(numbers)
 
     def decode(self, points: torch.Tensor) -> Params:
         """(*, D) points -> (*, P) numbers of the layout, the rest as in ``root``; differentiable."""
-        low, width, logarithmic = (part.to(points.device) for part in self._scale())
+        low, width, logarithmic = (part.to(points.device) for part in self._scale)
         scaled = low.to(points) + points * width.to(points)
         scaled = torch.where(logarithmic, torch.where(logarithmic, scaled, 0.0).exp(), scaled)
         where = self.free.to(points.device).nonzero()[:, 0]
