@@ -18,7 +18,7 @@ from PIL import Image as PILImage
 
 from unshade import cli
 from unshade.render import render
-from unshade.serde import dumps, load, parse
+from unshade.serde import dumps, parse
 from unshade.sphere import sphere_normals
 
 RED = "multiply(albedo(#cc2030), diffuse(left up, ambient=0.2))"

@@ -59,7 +59,8 @@ def test_find_pictures_takes_files_as_named_and_folders_by_suffix(tmp_path: Path
     for name in ("b.png", "a.JPG", "notes.txt", ".hidden.png"):
         (tmp_path / name).write_bytes(b"")
     named = tmp_path / "notes.txt"
-    assert find_pictures([named, tmp_path, tmp_path / "b.png"]) == [named, tmp_path / "a.JPG", tmp_path / "b.png"]
+    again = tmp_path / "x" / ".." / "b.png"
+    assert find_pictures([named, tmp_path, tmp_path / "b.png", again]) == [named, tmp_path / "a.JPG", tmp_path / "b.png"]
 
 
 def test_a_folder_without_pictures_is_an_error(tmp_path: Path) -> None:

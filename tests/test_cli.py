@@ -7,6 +7,7 @@ import importlib.util
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -182,6 +183,13 @@ def test_every_verb_has_help_with_examples(name: str, run: Run) -> None:
     assert told.code == 0
     assert "Examples:" in told.out
     assert f"unshade {name}" in told.out.split("Examples:")[1]
+
+
+def test_trees_in_the_examples_can_be_read(run: Run) -> None:
+    texts = re.findall(r'"(\w+\(.+\))"', (ROOT / "docs" / "cli.md").read_text(encoding="utf-8"))
+    assert len(texts) >= 4
+    for text in texts:
+        assert run("validate", text).code == 0
 
 
 def test_without_a_verb_it_says_what_there_is(run: Run) -> None:

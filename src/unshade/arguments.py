@@ -40,7 +40,7 @@ def output_options(function: Any) -> Any:
     for option in (
         click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors."),
         click.option("--json", "as_json", is_flag=True, help="Print one JSON object a picture, one a line, on standard output."),
-        click.option("--perceptual", is_flag=True, help="Measure st_lpips too (about a second a picture); else it is null."),
+        click.option("--perceptual", is_flag=True, help="Measure st_lpips too (a second or two a picture); else it is null."),
         click.option(
             "--artifacts",
             type=click.Choice(["none", "tree", "all"]),

@@ -77,18 +77,17 @@ def find_pictures(inputs: Iterable[Path]) -> list[Path]:
     """The named files and the pictures of the named folders, in order, each once. Raises PictureError for a folder without one."""
     from unshade.picture_files import SUFFIXES
 
-    found: dict[Path, None] = {}
+    found: dict[str, Path] = {}
     for path in inputs:
+        inside = [path]
         if path.is_dir():
-            inside = sorted(
-                entry for entry in path.iterdir() if entry.suffix.lower() in SUFFIXES and not entry.name.startswith(".") and entry.is_file()
-            )
+            entries = (entry for entry in path.iterdir() if entry.suffix.lower() in SUFFIXES and not entry.name.startswith("."))
+            inside = sorted(entry for entry in entries if entry.is_file())
             if not inside:
                 raise PictureError(f"{path}: expected a folder with pictures ({' '.join(sorted(SUFFIXES))}), found none")
-            found.update(dict.fromkeys(inside))
-        else:
-            found[path] = None
-    return list(found)
+        for picture in inside:
+            found.setdefault(_identity(picture), picture)
+    return list(found.values())
 
 
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{k}" for port in ("com", "lpt") for k in range(1, 10))}

@@ -229,7 +229,7 @@ def fit(
 
     \b
     Examples:
-      unshade fit ball.png --structure "screen(multiply(albedo, diffuse), highlight)" -o out
+      unshade fit ball.png --structure "screen(multiply(albedo(), diffuse()), highlight())" -o out
       unshade fit ball2.png --from out/ball --lock screen.1.highlight -o out
     """
     from unshade.terminal import Messages

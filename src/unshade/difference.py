@@ -9,6 +9,10 @@ from dataclasses import dataclass
 from unshade.nodes import KINDS, Leaf, Node, Raster, Value, steps
 
 
+MAX_PAIRS = 10_000
+"""Most pairs of children that are compared to find the most alike."""
+
+
 @dataclass(frozen=True)
 class Change:
     """One difference: ``removed`` (only in the first tree), ``added`` (only in the second) or ``changed``."""
@@ -61,7 +65,9 @@ def _below(address: str, step: str, node: Node) -> str:
 
 
 def _pair(ours: dict[str, Node], theirs: dict[str, Node]) -> dict[str, str]:
-    """Steps of one node to steps of the other, the most alike first, only nodes of one kind."""
+    """Steps of one node to steps of the other, the most alike first, only nodes of one kind; in order where there are very many."""
+    if len(ours) * len(theirs) > MAX_PAIRS:
+        return {step: step for step, node in ours.items() if step in theirs and theirs[step].kind == node.kind}
     costs = sorted(
         (_unlikeness(node, other), step, their) for step, node in ours.items() for their, other in theirs.items() if node.kind == other.kind
     )
