@@ -17,9 +17,11 @@ import unshade
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("examples/*.md"), *ROOT.glob("benchmarks/*.md")])
-LONGEST_FILE = 400
+LONGEST = {"src": 400, "scripts": 400, "tests": 600}
+"""Lines; the tests of one module stay together."""
 LONGER_FILES = {
-    "src/unshade/nodes.py": "the table of leaf kinds is part of it",
+    "src/unshade/cli.py": ("every verb with its help", 480),
+    "src/unshade/nodes.py": ("the table of leaf kinds is part of it", 640),
 }
 
 
@@ -156,13 +158,14 @@ def test_the_readme_runs(number: int, tmp_path: Path, monkeypatch: pytest.Monkey
 def test_every_source_file_has_one_idea() -> None:
     for path in sorted([*ROOT.glob("src/**/*.py"), *ROOT.glob("tests/**/*.py"), *ROOT.glob("scripts/*.py")]):
         name = path.relative_to(ROOT).as_posix()
+        _, limit = LONGER_FILES.get(name, ("", LONGEST[name.partition("/")[0]]))
         lines = len(path.read_text(encoding="utf-8").splitlines())
-        assert lines <= LONGEST_FILE or name in LONGER_FILES, f"{name} has {lines} lines; split it or say in LONGER_FILES why not"
+        assert lines <= limit, f"{name} has {lines} lines, more than {limit}; split it, or say in LONGER_FILES why not"
 
 
 def test_longer_files_are_still_long() -> None:
     for name in LONGER_FILES:
-        assert len(text_of(name).splitlines()) > LONGEST_FILE, f"{name} is short enough now; take it off the list"
+        assert len(text_of(name).splitlines()) > LONGEST["src"], f"{name} is short enough now; take it off the list"
 
 
 def test_version_is_one() -> None:
