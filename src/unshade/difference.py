@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from unshade.nodes import KINDS, Leaf, Node, Raster, Value, steps
 
-
 MAX_PAIRS = 10_000
 """Most pairs of children that are compared to find the most alike."""
 
