@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from torch import Tensor
 
@@ -53,14 +52,6 @@ def mix_gains(left: Tensor, right: Tensor, mask: Tensor) -> list[Tensor | float]
     return [mask, 1.0 - mask, left - right]
 
 
-class _Layers(Protocol):
-    def __call__(self, *layers: Tensor) -> Tensor: ...
-
-
-class _Gains(Protocol):
-    def __call__(self, *layers: Tensor) -> list[Tensor | float]: ...
-
-
 @dataclass(frozen=True)
 class Blend:
     """An operator of the grammar.
@@ -70,8 +61,8 @@ class Blend:
     """
 
     name: str
-    apply: _Layers
-    gains: _Gains
+    apply: Callable[..., Tensor]
+    gains: Callable[..., list[Tensor | float]]
     identity: float | None
     """The constant layer that changes nothing, where there is one."""
     summary: str

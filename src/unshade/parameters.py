@@ -59,8 +59,8 @@ class Layout:
 
         def rebuild(node: Node) -> Node:
             if isinstance(node, Leaf):
-                filled = (old if isinstance(old, Raster) else tuple(numbers[slot]) for old, slot in zip(node.values, next(found), strict=True))
-                return Leaf(node.kind, tuple(filled), node.name)
+                slots = zip(node.values, next(found), strict=True)
+                return Leaf(node.kind, tuple(old if isinstance(old, Raster) else tuple(numbers[slot]) for old, slot in slots), node.name)
             children = tuple(rebuild(child) for child in node.children)
             mask = rebuild(node.mask) if node.mask is not None else None
             return Operator(node.kind, children, mask, node.name)  # type: ignore[arg-type]
