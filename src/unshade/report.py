@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from unshade.decompose import Result
     from unshade.pictures import SphereImage
 
-BUDGET = 1_300_000
-"""Characters of all sheets together. The trees nearest to the chosen one get theirs first."""
+BUDGET = 1_400_000
+"""Characters of the page; a family that needs more has points that cannot be chosen."""
 
 GAINS = (1, 2, 4, 8, 16, 32, 64)
 """How many times brighter the difference may be shown."""
@@ -82,31 +82,33 @@ def report_html(result: Result, sphere: SphereImage, source_name: str, figures: 
     members[chosen] = Member(result.tree, result.psnr)
     shown = {"seed": result.seed, "preset": result.preset, **figures}
     sheets = {chosen: _sheet(chosen, members[chosen], picture, "The chosen tree", shown, fine=True)}
-    room = BUDGET - _length(sheets[chosen])
-    for key in sorted(members, key=lambda key: (key in keys, abs(keys.index(key) - family.chosen) if key in keys else 0)):
-        if key != chosen:
-            sheet = _sheet(key, members[key], picture, _standing(key in others, members[key], result.tree), {})
-            room -= _length(sheet)
-            if room < 0:
-                break
-            sheets[key] = sheet
+    template = (resources.files("unshade") / "report_template.html").read_text(encoding="utf-8")
+    stored = base64.b64encode(dumps(family).encode()).decode()
+    shown_input = data_uri(image, "webp")
+    room = BUDGET - len(template) - len(stored) - len(shown_input) - _length(sheets[chosen])
+    for key in [*others, *(keys[index] for index in _by_interest(len(keys), family.chosen))]:
+        sheet = _sheet(key, members[key], picture, _standing(key in others, members[key], result.tree), {})
+        room -= _length(sheet) + len(_choice(key, members[key], False))
+        if room < 0:
+            break
+        sheets[key] = sheet
 
     points = [Point(key, member.values, member.psnr, key in sheets, key == chosen, key in others) for key, member in members.items()]
-    template = (resources.files("unshade") / "report_template.html").read_text(encoding="utf-8")
     return _filled(
         template,
         {
             "title": escape(source_name),
             "tree_style": STYLE,
             "chosen": chosen,
-            "input": data_uri(image, "webp"),
+            "input": shown_input,
             "size": str(size),
             "chart": chart(points),
             "strip": "".join(_choice(key, members[key], key == chosen) for key in keys if key in sheets),
             "others": _others({key: members[key] for key in others if key in sheets}),
             "count": str(len(keys)),
+            "family_state": "hidden" if len(members) == 1 else "",
             "templates": "".join(_template(key, sheet) for key, sheet in sheets.items() if key != chosen),
-            "json": base64.b64encode(dumps(family).encode()).decode(),
+            "json": stored,
             "file_name": escape(re.sub(r"[^\w.-]+", "_", source_name).rpartition(".")[0] or "tree") + ".tree.json",
             **{f"slot_{slot}": sheets[chosen][slot] for slot in SLOTS},
         },
@@ -116,6 +118,16 @@ def report_html(result: Result, sphere: SphereImage, source_name: str, figures: 
 def _filled(template: str, values: Mapping[str, str]) -> str:
     """Replace every ``{{name}}`` in one pass, so that what is put in is never searched again."""
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found[1]], template)
+
+
+def _by_interest(count: int, chosen: int) -> list[int]:
+    """The other trees of a family: the neighbours of the chosen one, the ends, then ever finer steps between them."""
+    wanted = [chosen - 1, chosen + 1, 0, count - 1]
+    step = 1 << count.bit_length()
+    while step > 1:
+        step //= 2
+        wanted += range(step, count, step)
+    return [index for index in dict.fromkeys(wanted) if 0 <= index < count and index != chosen]
 
 
 def _length(sheet: Mapping[str, str]) -> int:
