@@ -189,7 +189,9 @@ def _tell(record: batch.Record, messages: Messages, before: str = "") -> None:
     if "error" in record:
         messages.fail(record["error"])
     else:
-        where = f"  {Path(record['tree']).parent}" if record["tree"] else ""
+        folder = Path(record["tree"]).parent if record["tree"] else None
+        page = folder / "report.html" if folder else None
+        where = f"  {page if page and page.exists() else folder}" if folder else ""
         messages.say(f"{record['input']}: {before}{figures_line(record)}{where}", "dim" if before else "")
 
 
