@@ -97,7 +97,7 @@ def environment(normals: Normals, direction: Params, sharpness: Params, color: P
 def rotate(directions: Normals, rotation: Params) -> Normals:
     """Turn (*, 3, H, W) directions by an axis-angle vector (*, 3) in radians (Rodrigues)."""
     angle = rotation.square().sum(-1, keepdim=True).clamp(min=1e-24).sqrt()
-    axis = _image(rotation / angle).expand_as(directions)
+    directions, axis = torch.broadcast_tensors(directions, _image(rotation / angle))
     cosine, sine = _image(angle.cos()), _image(angle.sin())
     along = (axis * directions).sum(-3, keepdim=True)
     return directions * cosine + torch.linalg.cross(axis, directions, dim=-3) * sine + axis * along * (1.0 - cosine)
