@@ -102,6 +102,29 @@ def test_a_leaf_that_is_called_constant_is(node: Leaf) -> None:
 
 
 @pytest.mark.parametrize(
+    ("written", "color"),
+    [
+        ("threshold(up, -1.1, 0.2)", (1.0, 1.0, 1.0)),
+        ("threshold(up, -1.09, 0.2)", None),
+        ("threshold(up, 1.1, 0.2)", (0.0, 0.0, 0.0)),
+        ("threshold(up, 1.09, 0.2)", None),
+        ("toon_diffuse(up, 0.3, -1.1, 0.1)", (1.0, 1.0, 1.0)),
+        ("toon_diffuse(up, 0.3, -1.09, 0.1)", None),
+        ("toon_diffuse(up, 0.3, 1, 0.1)", (0.3, 0.3, 0.3)),
+        ("toon_diffuse(up, 0.3, 0.99, 0.1)", None),
+        ("toon_highlight(radius=0)", (0.0, 0.0, 0.0)),
+        ("toon_highlight(radius=0, softness=0.1)", None),
+    ],
+)
+def test_where_an_edge_leaves_the_sphere_a_leaf_is_constant(written: str, color: tuple[float, ...] | None) -> None:
+    if written.startswith("threshold"):
+        written = f"mix(albedo(white), albedo(black), {written})"
+    node = root(written)
+    found = node.mask if isinstance(node, Operator) else node
+    assert found is not None and constant(found) == color
+
+
+@pytest.mark.parametrize(
     ("written", "expected"),
     [
         ("screen(highlight(), screen(rim(), highlight()))", "screen(highlight,highlight,rim)"),
@@ -170,8 +193,16 @@ def test_canonical_of_a_tree_too_deep_is_refused() -> None:
 
 def test_lobes_and_raster_sizes_belong_to_the_structure() -> None:
     assert not same_structure(root("environment(up)"), root("environment(up; left)"))
-    small, wide = (Raster(3, 1, width, bytes(6 * width)) for width in (1, 2))
+    small, wide = (Raster(3, 1, width, bytes(range(6 * width))) for width in (2, 3))
     assert not same_structure(leaf("image", pixels=small), leaf("image", pixels=wide))
+
+
+def test_a_picture_of_one_colour_is_an_albedo() -> None:
+    plain = Raster.from_array(torch.tensor([0.2, 0.4, 0.6]).view(3, 1, 1).expand(3, 4, 5))
+    assert structure_key(leaf("image", pixels=plain)) == "albedo"
+    assert canonical(leaf("environment_map", pixels=plain)) == canonical(leaf("image", pixels=plain))
+    white = leaf("image_mask", pixels=Raster(1, 2, 1, b"\xff" * 4))
+    assert canonical(mix(leaf("diffuse"), leaf("rim"), white)) == leaf("diffuse")
 
 
 def test_numbers_do_not_belong_to_the_structure() -> None:
@@ -303,6 +334,8 @@ def _without(node: Node, address: str) -> Node:
         ("screen(multiply(albedo(white), diffuse(left)), highlight(up front))", False),
         ("screen(mix(albedo(red), albedo(#fe0000), stripe(up)), highlight(up front))", False),
         ("screen(mix(albedo(red), albedo(blue), threshold(back, 0.1)), highlight(up front))", False),
+        ("multiply(albedo(#030303), screen(diffuse(left), highlight(up front)))", False),
+        ("multiply(albedo(#f0f0a0), screen(diffuse(left), highlight(up front)))", True),
         ("screen(albedo(#202020), environment(up, 5, grey; left, 5, grey))", True),
         ("screen(albedo(#202020), environment(up, 5, grey; left, 5, black))", False),
     ],

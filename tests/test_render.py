@@ -74,6 +74,21 @@ def test_a_batch_of_parameters_equals_a_loop(node: Node, seed: int) -> None:
     assert torch.allclose(together, alone, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_every_leaf_broadcasts_normals_and_parameters(name: str) -> None:
+    kind = KINDS[name]
+    drawn = [torch.stack([_numbers(parameter, 10 * seed + k) for seed in range(2)]) for k, parameter in enumerate(kind.parameters)]
+    many = [numbers[:, None] if kind.repeats else numbers for numbers in drawn]
+    one = [numbers[0] for numbers in many]
+    batch = torch.stack([NORMALS, NORMALS.flip(-1)])
+    alone = kind.formula(NORMALS, *one)
+    assert alone.shape == (kind.channels, 12, 12)
+    for normals, parameters in ((NORMALS, many), (batch, one), (batch, many)):
+        together = kind.formula(normals, *parameters)
+        assert together.shape == (2, kind.channels, 12, 12)
+        assert torch.allclose(together[0], alone, rtol=0, atol=1e-12)
+
+
 @given(nodes(max_leaves=4))
 @settings(max_examples=15)
 def test_one_set_of_parameters_for_each_picture(node: Node) -> None:
@@ -355,7 +370,7 @@ GOLDEN_TREES: dict[str, Any] = {
     "highlight": "highlight((0.3, 0.4, 0.87), sharpness=20, amplitude=1.4)",
     "rim": "rim(right up, exponent=1.5)",
     "toon_diffuse": "toon_diffuse(left up front, ambient=0.4, threshold=0.2, softness=0.1)",
-    "toon_highlight": "toon_highlight((0.3, 0.4, 0.87), radius=0.3, brightness=0.8, softness=0.05)",
+    "toon_highlight": "toon_highlight((0.3, 0.4, 0.87), radius=0.35, brightness=0.8, softness=0.2)",
     "environment": "environment(up, 8, #80a0ff; left, 30, #ffe0a0; right down, 3, #402010)",
     "environment_map": Tree(leaf("environment_map", pixels=_ramp(3, 8, 16), rotation=(0.2, 0.7, -0.1))),
     "image": Tree(leaf("image", pixels=_ramp(3, 9, 7))),

@@ -217,6 +217,9 @@ def test_bad_png_is_refused() -> None:
     [
         ('{"version": 1, "tree": {"root": {"kind"', "not JSON, or truncated"),
         ("[1]", "expected a JSON object"),
+        (json.dumps({"version": 1, "tree": {"root": ALBEDO, "exposure": "2"}}), "tree.exposure: expected a number, got a string"),
+        (json.dumps({"version": 1, "tree": {"root": ALBEDO, "blend_space": ["srgb"]}}), "tree.blend_space: expected srgb or linear"),
+        (json.dumps({"version": 1, "tree": [ALBEDO]}), "tree: expected an object, got a list"),
         ('{"tree": {}}', "version: expected 1, got none"),
         ('{"version": "1", "tree": {}}', "version: expected 1, got '1'"),
         ('{"version": true, "tree": {}}', "version: expected 1"),

@@ -101,6 +101,11 @@ def constant(leaf: Leaf) -> Color | None:
         return BLACK
     if leaf.kind in ("diffuse", "toon_diffuse") and _scalar(leaf, "ambient") >= 1.0:
         return WHITE
+    if leaf.kind in ("image", "environment_map", "image_mask"):
+        pixels = cast(Raster, leaf["pixels"]).array()
+        pixels = pixels.reshape(len(pixels), -1)
+        color = [float(channel) for channel in pixels[:, 0]] * (3 // len(pixels))
+        return cast(Color, tuple(color)) if (pixels == pixels[:, :1]).all() else None
     if leaf.kind == "environment" and not any(cast("tuple[float, ...]", leaf["color"])):
         return BLACK
     if leaf.kind in ("toon_diffuse", "threshold"):
