@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from unshade.blend import BLENDS
@@ -36,7 +37,7 @@ def render(tree: Tree | Node, normals: Normals, parameters: Params | None = None
     if parameters is None:
         parameters = layout.pack(root).to(normals)
     shaded = evaluate(root, normals, parameters, layout)
-    batch = torch.broadcast_shapes(normals.shape[:-3], parameters.shape[:-1])
+    batch = np.broadcast_shapes(normals.shape[:-3], parameters.shape[:-1])
     shaded = shaded.expand(*batch, 3, *normals.shape[-2:])
     return srgb_encode(shaded) if space == "linear" else shaded
 
