@@ -265,6 +265,19 @@ def test_json_has_the_promised_keys_and_types(decomposed: list[dict[str, Any]], 
     assert files(tmp_path / "out") == ["ball/tree.json", "results.jsonl"]
 
 
+def test_missing_weights_are_told_before_the_work(
+    decomposed: list[dict[str, Any]], ball: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing() -> None:
+        raise unshade.errors.MissingExtraError("st_lpips needs weights")
+
+    monkeypatch.setattr("unshade.models.perceptual.weight_file", missing)
+    told = run("decompose", ball, "-o", tmp_path / "out", "--perceptual")
+    assert (told.code, told.err) == (6, f"unshade: error: {ball}: st_lpips needs weights\n")
+    assert decomposed == []
+    assert not (tmp_path / "out").exists()
+
+
 def test_nothing_is_written_when_nothing_is_asked_for(decomposed: list[dict[str, Any]], ball: Path, tmp_path: Path, run: Run) -> None:
     told = run("decompose", ball, "--artifacts", "none", "--json", "--quiet")
     assert told.records[0]["tree"] is None

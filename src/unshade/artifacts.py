@@ -40,7 +40,7 @@ def figures(result: Result, sphere: SphereImage, perceptual: bool) -> Figures:
     return {
         "psnr": _finite(metrics.psnr(rendered, sphere.image, sphere.valid)),
         "ssim": _finite(metrics.ssim(rendered, sphere.image, sphere.valid)),
-        "st_lpips": _finite(metrics.st_lpips(rendered, sphere.image)) if perceptual else None,
+        "st_lpips": _finite(metrics.st_lpips(rendered, sphere.image, mask=sphere.valid)) if perceptual else None,
         "values": result.tree.values,
         "leaves": result.tree.leaves,
         "seed": result.seed,

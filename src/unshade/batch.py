@@ -236,8 +236,12 @@ def fit_picture(job: Job, tree: Tree, locked: Sequence[str]) -> Record:
 
 
 def _read(job: Job) -> SphereImage:
+    from unshade.models import perceptual
     from unshade.pictures import read_sphere
 
+    if job.settings.perceptual:
+        # Missing weights are told before the work, not after it.
+        perceptual.weight_file()
     return read_sphere(job.picture, disc=job.settings.disc, ignore=Path(job.settings.mask) if job.settings.mask else None)
 
 
