@@ -20,8 +20,14 @@ ANGLES = 360
 MIN_COVERAGE = 0.45
 """Share of the circle that must show as an edge."""
 
+MIN_RADIUS = 5.0
+"""Smallest sphere that is looked for, in pixels."""
+
 SNAP = 0.015
 """A circle this close to the inscribed disc of a square picture, as a share of its radius, is that disc."""
+
+SNAP_OUTSIDE = 0.05
+"""The same for a circle that leaves the frame: then it was measured on the few arcs that the corners show."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,8 @@ def find_disc(rgb: Array) -> Disc | None:
     circle = find_circle(rgb)
     if circle is not None:
         frame = inscribed_disc(width, height)
-        if square and abs(circle.r - frame.r) < SNAP * frame.r and np.hypot(circle.cx - frame.cx, circle.cy - frame.cy) < SNAP * frame.r:
+        apart = max(abs(circle.r - frame.r), np.hypot(circle.cx - frame.cx, circle.cy - frame.cy)) / frame.r
+        if square and apart < (SNAP_OUTSIDE if _leaves(circle, width, height) else SNAP):
             return Disc(frame.cx, frame.cy, frame.r, circle.score)
         return circle
     if square:
@@ -87,6 +94,10 @@ def find_disc(rgb: Array) -> Disc | None:
         if score > 0.0:
             return inscribed_disc(width, height, score)
     return None
+
+
+def _leaves(circle: Disc, width: int, height: int) -> bool:
+    return min(circle.cx, circle.cy, width - circle.cx, height - circle.cy) < circle.r - 0.5
 
 
 def smoothness(rgb: Array) -> float:
@@ -111,7 +122,8 @@ def find_circle(rgb: Array) -> Disc | None:
     """A sphere in front of a plain, graded or noisy background, anywhere in the frame.
 
     A smooth background is fitted to the border and to what agrees with it; the outline of what differs gives circles
-    by consensus of three points; the best is then measured along rays at full resolution.
+    by consensus of three points; the best is then measured along rays at full resolution. Where no background fits
+    (a floor and a wall), the strongest edges of a frame that is not square give the points.
 
     Args:
         rgb: (H, W, 3) display-encoded.
@@ -119,22 +131,29 @@ def find_circle(rgb: Array) -> Disc | None:
     height, width = rgb.shape[:2]
     scale = min(1.0, WORKING_SIDE / max(height, width))
     small = _resized(rgb, max(8, round(width * scale)), max(8, round(height * scale)))
+    smooth = _smoothed(small)
     sx, sy = small.shape[1] / width, small.shape[0] / height
-    background, noise = _background(_smoothed(small))
-    distance = np.linalg.norm(_smoothed(small) - background, axis=-1)
+
+    def measured(points: Array) -> Disc | None:
+        start = _ransac_circle(points)
+        return None if start is None else _measured(rgb, (start[0] / sx, start[1] / sy, start[2] / (0.5 * (sx + sy))), 1.0 / min(sx, sy))
+
+    background, noise = _background(smooth)
+    distance = np.linalg.norm(smooth - background, axis=-1)
     best: Disc | None = None
     for threshold in (max(4.0 * noise, 0.02), max(8.0 * noise, 0.05), max(12.0 * noise, 0.12)):
         foreground = distance > threshold
         if not 0.005 < foreground.mean() < 0.98:
             continue
-        component = _largest_component(foreground)
-        start = _ransac_circle(_outline(component))
-        if start is None:
-            continue
-        found = _measured(rgb, (start[0] / sx, start[1] / sy, start[2] / (0.5 * (sx + sy))), 1.0 / min(sx, sy))
-        if found is None or not _stands_alone(foreground, found, sx, sy):
+        found = measured(_outline(_largest_component(foreground)))
+        if found is None or not (_stands_alone(foreground, found, sx, sy) or _plain_outside(small, smooth, found, sx, sy)):
             continue
         if best is None or found.score > best.score + 0.02:
+            best = found
+    if best is None and abs(width - height) > 1:
+        strength, edges = _edges(smooth)
+        found = measured(edges)
+        if found is not None and found.score > 0.8 and _few_edges_outside(strength, found, sx, sy):
             best = found
     return best
 
@@ -157,17 +176,63 @@ def _measured(rgb: Array, circle: tuple[float, float, float], pixel: float) -> D
     return Disc(float(cx), float(cy), float(r), float(coverage))
 
 
+def _radius(shape: tuple[int, ...], disc: Disc, sx: float, sy: float) -> Array:
+    """(h, w) of every pixel of the working copy, the distance from the disc's centre in its radii."""
+    rows, columns = np.indices(shape[:2])
+    return np.hypot((columns + 0.5) / sx - disc.cx, (rows + 0.5) / sy - disc.cy) / disc.r
+
+
 def _stands_alone(foreground: NDArray[np.bool_], disc: Disc, sx: float, sy: float) -> bool:
-    """True where the background really is background: little of the foreground lies outside the disc, and most of
-    the disc is foreground."""
-    rows, columns = np.indices(foreground.shape)
-    radius = np.hypot((columns + 0.5) / sx - disc.cx, (rows + 0.5) / sy - disc.cy) / disc.r
+    """True where the background really is background: little of the foreground lies outside the disc (a shadow may,
+    beside a circle that shows all around), and most of the disc is foreground."""
+    radius = _radius(foreground.shape, disc, sx, sy)
     inside, outside = radius < 0.97, radius > 1.06
-    area = max(1, int((radius < 1.0).sum()))
-    return bool((foreground & outside).sum() < 0.10 * area and foreground[inside].mean() > 0.4 and inside.sum() > 0.002 * inside.size)
+    allowed = 0.5 if disc.score > 0.85 else 0.1
+    return bool((foreground & outside).sum() < allowed * (radius < 1.0).sum() and foreground[inside].mean() > 0.4)
 
 
-MIN_RADIUS = 5.0
+def _plain_outside(small: Array, smooth: Array, disc: Disc, sx: float, sy: float) -> bool:
+    """True where all that lies outside a well visible circle is one smooth surface, of fifth degree at most."""
+    outside = _radius(small.shape, disc, sx, sy) > 1.06
+    if disc.score < 0.75 or outside.mean() < 0.25:
+        return False
+    y, x = np.meshgrid(np.linspace(-1, 1, small.shape[0]), np.linspace(-1, 1, small.shape[1]), indexing="ij")
+    design, colors = _powers(x[outside], y[outside], 5), smooth[outside]
+    weights, *_ = np.linalg.lstsq(design, colors, rcond=None)
+    rest = np.linalg.norm(colors - design @ weights, axis=-1)
+    noise = float(np.median(np.linalg.norm((small - smooth)[outside], axis=-1)))
+    return float(np.percentile(rest, 90)) < max(0.06, 2.0 * noise)
+
+
+def _edges(smooth: Array) -> tuple[Array, Array]:
+    """The strength of the gradient, (h, w), and the (N, 2) places of its sharpest crests."""
+    dx = np.zeros(smooth.shape[:2])
+    dy = np.zeros(smooth.shape[:2])
+    dx[:, 1:-1] = np.linalg.norm(smooth[:, 2:] - smooth[:, :-2], axis=-1)
+    dy[1:-1] = np.linalg.norm(smooth[2:] - smooth[:-2], axis=-1)
+    strength = np.hypot(dx, dy)
+    limit = max(0.03, 0.25 * float(np.percentile(strength, 99)))
+    inner = strength[1:-1, 1:-1]
+    across = (inner >= strength[1:-1, :-2]) & (inner >= strength[1:-1, 2:]) & (dx >= dy)[1:-1, 1:-1]
+    down = (inner >= strength[:-2, 1:-1]) & (inner >= strength[2:, 1:-1]) & (dx < dy)[1:-1, 1:-1]
+    crest = np.zeros(strength.shape, dtype=bool)
+    crest[1:-1, 1:-1] = (inner > limit) & (across | down)
+    rows, columns = np.nonzero(crest)
+    points = np.stack([columns + 0.5, rows + 0.5], axis=1)
+    return np.where(crest, strength, 0.0), points[:: max(1, len(points) // 1500)]
+
+
+def _few_edges_outside(strength: Array, disc: Disc, sx: float, sy: float) -> bool:
+    """True where the edges outside a circle, as strong as its own, add up to less than twice its length."""
+    radius = _radius(strength.shape, disc, sx, sy)
+    own = strength[(np.abs(radius - 1.0) < 0.06) & (strength > 0)]
+    return bool(own.size) and int((strength[radius > 1.06] > 0.5 * np.median(own)).sum()) < own.size
+
+
+def _powers(x: Array, y: Array, degree: int) -> Array:
+    """(..., terms) the products of powers of two coordinates, lower degrees first."""
+    return np.stack([x**i * y ** (total - i) for total in range(degree + 1) for i in range(total + 1)], axis=-1)
+
 
 
 def _resized(rgb: Array, width: int, height: int) -> Array:
@@ -190,7 +255,7 @@ def _background(rgb: Array) -> tuple[Array, float]:
     height, width = rgb.shape[:2]
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     edge = max(1, round(0.02 * min(height, width)))
-    powers = np.stack([x**i * y ** (degree - i) for degree in range(4) for i in range(degree + 1)], axis=-1)
+    powers = _powers(x, y, 3)
     border = np.ones((height, width), dtype=bool)
     border[edge:-edge, edge:-edge] = False
     member, noise = border, 0.0
@@ -337,12 +402,17 @@ def _refine(picture: Array, circle: tuple[float, float, float], reach: float) ->
     slope = (np.roll(slope, 1, axis=0) + slope + np.roll(slope, -1, axis=0)) / 3.0
     strength = np.linalg.norm(slope, axis=-1)
     at = offsets[lag:] - 0.5 * step * lag
-    peak = strength.argmax(axis=1)
+    # The outermost edge that is not weak beside the strongest: a rim light or a drawn outline has a second one inside.
+    before, after = np.pad(strength, ((0, 0), (1, 1)))[:, :-2], np.pad(strength, ((0, 0), (1, 1)))[:, 2:]
+    outside = strength[:, at > 0.6 * reach]
+    rough = max(0.012, 3.0 * float(np.median(outside)))
+    crest = (strength >= before) & (strength >= after) & (strength > np.maximum(0.3 * strength.max(axis=1, keepdims=True), rough))
+    peak = np.where(crest.any(axis=1), len(at) - 1 - crest[:, ::-1].argmax(axis=1), strength.argmax(axis=1))
     height_of = strength[np.arange(len(peak)), peak]
     window = np.abs(at[None] - at[peak][:, None]) <= 1.0
     weight = np.square(strength) * window
     edge = (weight * at).sum(1) / np.maximum(weight.sum(1), 1e-12)
-    contrast = height_of > np.maximum(0.012, 3.0 * np.median(strength, axis=1))
+    contrast = height_of > rough
     interior = (peak > 0) & (peak < len(at) - 1)
     good = contrast & interior
     if good.sum() < 0.2 * ANGLES:
