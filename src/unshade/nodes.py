@@ -41,8 +41,8 @@ class Role(enum.Enum):
     MASK = "mask"
 
 
-BROAD_SHARPNESS = 3.0
-"""The one border between broad and sharp: a highlight with a smaller sharpness (half-width over about 28 degrees) is form, hence
+BROAD_SHARPNESS = 6.0
+"""The one border between broad and sharp: a highlight with a smaller sharpness (half-width over about 20 degrees) is form, hence
 part of the diffuse; a sharper one is a light's reflection."""
 
 
@@ -181,7 +181,7 @@ for _kind in (
             _direction("the normal that the spot is centred on"),
             _scalar("radius", 0.0, math.pi, 0.3, "angle from the centre to the edge", "radians"),
             _scalar("brightness", 0.0, 1.0, 1.0, "brightness inside"),
-            _softness(0.0),
+            _scalar("softness", 0.0, 2.5, 0.0, "width of the edge; 0 is a hard edge", "radians"),
         ),
         "a spot with an edge",
         amplitude="brightness",

@@ -7,6 +7,7 @@ of one pixel's normal, so it works on a sphere, a normal map and a mesh alike.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 
@@ -35,7 +36,7 @@ def smoothstep(low: torch.Tensor, width: torch.Tensor, x: torch.Tensor) -> torch
 
 def albedo(normals: Normals, color: Params) -> Image:
     """One colour everywhere. Source: Geng et al. 2023, table 1."""
-    return _image(color).expand(*torch.broadcast_shapes(color.shape[:-1], normals.shape[:-3]), 3, *normals.shape[-2:])
+    return _image(color).expand(*np.broadcast_shapes(color.shape[:-1], normals.shape[:-3]), 3, *normals.shape[-2:])
 
 
 def diffuse(normals: Normals, direction: Params, ambient: Params) -> Image:
@@ -73,12 +74,14 @@ def toon_diffuse(normals: Normals, direction: Params, ambient: Params, threshold
 
 
 def toon_highlight(normals: Normals, direction: Params, radius: Params, brightness: Params, softness: Params) -> Image:
-    """A spot with an edge: ``brightness`` within ``radius`` (radians) of the light.
+    """A spot with an edge: ``brightness`` within ``radius`` of the light, over an edge of width ``softness`` centred there.
 
-    The released grammar cuts a highlight at a threshold and scales it; only these numbers of it can be seen.
+    Radius and softness are angles in radians. The released grammar cuts a highlight at a threshold and scales it; only
+    these numbers of it can be seen.
     """
-    edge = _image(radius).cos() - 0.5 * _image(softness)
-    return _image(brightness) * smoothstep(edge, _image(softness), facing(normals, direction))
+    angle = facing(normals, direction).clamp(-1.0 + 1e-7, 1.0 - 1e-7).acos()
+    softness = _image(softness)
+    return _image(brightness) * (1.0 - smoothstep(_image(radius) - 0.5 * softness, softness, angle))
 
 
 def environment(normals: Normals, direction: Params, sharpness: Params, color: Params) -> Image:
@@ -124,7 +127,7 @@ def image(normals: Normals, pixels: torch.Tensor) -> Image:
 
 def _lookup(pixels: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     """Bilinear samples of (*, C, h, w) at x, y (*, H, W) in [-1, 1], pixel edges at -1 and 1."""
-    batch = torch.broadcast_shapes(pixels.shape[:-3], x.shape[:-2])
+    batch = np.broadcast_shapes(pixels.shape[:-3], x.shape[:-2])
     grid = torch.stack([x, y], dim=-1).expand(*batch, *x.shape[-2:], 2).reshape(-1, *x.shape[-2:], 2)
     source = pixels.expand(*batch, *pixels.shape[-3:]).reshape(-1, *pixels.shape[-3:])
     found = F.grid_sample(source.to(grid), grid, mode="bilinear", padding_mode="border", align_corners=False)

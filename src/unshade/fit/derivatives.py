@@ -47,9 +47,10 @@ def toon_diffuse(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tenso
 
 
 def toon_highlight(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, radius: Params, brightness: Params, softness: Params) -> Derivatives:
-    step, slope, t = _edge(facing, radius.cos() - 0.5 * softness, softness)
+    cosine = facing.clamp(-1.0 + 1e-7, 1.0 - 1e-7)
+    step, slope, t = _edge(cosine.acos(), radius - 0.5 * softness, softness)
     slope = brightness * slope
-    return slope, slope * radius.sin(), step, slope * (0.5 - t)
+    return slope / (1.0 - cosine.square()).sqrt(), slope, 1.0 - step, slope * (t - 0.5)
 
 
 def threshold(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, threshold: Params, softness: Params) -> Derivatives:
@@ -80,5 +81,5 @@ def forward_mode(kind: str, normals: torch.Tensor, parameters: list[torch.Tensor
     with forward_ad.dual_level():
         dual = [forward_ad.make_dual(p.expand_as(t).contiguous(), t.contiguous()) for p, t in zip(parameters, tangents, strict=True)]
         tangent = forward_ad.unpack_dual(KINDS[kind].formula(normals, *dual)).tangent
-        shape = torch.broadcast_shapes(tangents[0].shape[:2])
+        shape = tangents[0].shape[:2]
     return tangent.expand(*shape, *tangent.shape[-3:])[..., 0, :]

@@ -10,74 +10,32 @@ their bounds are held there while the gradient pushes outwards.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 
-from unshade import sphere
 from unshade.blend import BLENDS
 from unshade.fit.derivatives import ANALYTIC, forward_mode
 from unshade.fit.fitted import Fitted
+from unshade.fit.pixels import Pixels
 from unshade.nodes import KINDS, Leaf, Node, Operator, Raster
 from unshade.parameters import Layout
 from unshade.shading import facing
 from unshade.types import Image, Mask
 
 
-@dataclass(frozen=True)
-class Pixels:
-    """The pixels of a picture that count: ``normals`` (3, N), ``target`` (3, N) and ``weight`` (N,), which sums to 1."""
+COARSE_SIZE = 40
+"""Pictures are averaged down to this many pixels a side where edges do not matter yet."""
 
-    normals: torch.Tensor
-    target: torch.Tensor
-    weight: torch.Tensor
-
-    @staticmethod
-    def of(image: Image, valid: Mask | None = None, size: int | None = None, radius: float = sphere.SCORED_RADIUS) -> Pixels:
-        """Pixels of a (3, H, H) picture inside ``radius`` and ``valid`` (1, H, H), averaged down to ``size`` x ``size``.
-
-        A cell counts by the share of it that is inside, and its normal is the mean of the normals inside.
-        """
-        full = image.shape[-1]
-        inside = sphere.disc_mask(full, radius, image.device)
-        if valid is not None:
-            inside = inside & valid
-        normals = sphere.sphere_normals(full, image.device, image.dtype)
-        share = inside.to(image.dtype)
-        if size is not None and size < full:
-            stack = torch.cat([image * share, normals * share, share])
-            stack = F.adaptive_avg_pool2d(stack[None], size)[0]
-            share = stack[6:]
-            image, normals = stack[:3] / share.clamp(min=1e-6), stack[3:6] / share.clamp(min=1e-6)
-            normals = F.normalize(normals, dim=0)
-        keep = share[0] > 0.2
-        weight = share[0][keep]
-        return Pixels(normals[:, keep].contiguous(), image[:, keep].contiguous(), weight / weight.sum())
-
-    @property
-    def count(self) -> int:
-        """N."""
-        return self.normals.shape[1]
-
-
-@dataclass
-class _Group:
-    """Leaves of one kind, evaluated as one batch."""
-
-    kind: str
-    leaves: list[int]
-    index: list[torch.Tensor]
-    """One (K, n) index into the flat vector a parameter."""
-    rasters: list[tuple[torch.Tensor | None, ...]]
-    dof: list[list[int]]
-    """First column of each leaf in the Jacobian; -1 where the leaf is fixed."""
+COARSE_SOFTNESS = 0.04
+FINE_SOFTNESS = 0.012
+"""Narrowest edges while fitting, about 1.5 pixels of a picture of 256: a narrower one has no slope that a pixel could see."""
 
 
 class Model:
     """A structure at given pixels: values, gains and Jacobian."""
 
-    def __init__(self, root: Node, pixels: Pixels, locked: Collection[str] = ()) -> None:
+    def __init__(self, root: Node, pixels: Pixels, locked: Collection[str] = (), softest: float = 0.0) -> None:
         self.root, self.pixels = root, pixels
         self.layout = Layout.of(root)
         self.normals = pixels.normals[:, None, :]
@@ -86,6 +44,8 @@ class Model:
         self.addresses: list[str] = []
         self._collect(root, root.kind)
         self._columns(frozenset(locked))
+        soft = torch.tensor([self.layout.names[k].endswith(".softness") for k in self.number.tolist()], dtype=torch.bool)
+        self.low = torch.where(soft, self.low.clamp(min=softest), self.low)
 
     def _collect(self, node: Node, address: str) -> None:
         if isinstance(node, Leaf):
@@ -352,9 +312,27 @@ def minimise(model: Model, vector: torch.Tensor, steps: int, tolerance: float = 
     return vector, error, history
 
 
-def fit_pixels(pixels: Pixels, root: Node, *, locked: Collection[str] = (), steps: int = 30, tolerance: float = 1e-4) -> Fitted:
+def fit_pixels(pixels: Pixels, root: Node, *, locked: Collection[str] = (), steps: int = 30, tolerance: float = 1e-4, softest: float = 0.0) -> Fitted:
     """Fit the parameters of a structure at given pixels, from the tree's own numbers."""
-    with torch.inference_mode():
-        model = Model(root, pixels, locked)
-        vector, error, history = minimise(model, model.layout.pack(root), steps, tolerance)
+    with torch.no_grad():
+        model = Model(root, pixels, locked, softest)
+        start = model.layout.pack(root)
+        start[model.number] = torch.where(model.plain, start[model.number].clamp(model.low, model.high), start[model.number])
+        vector, error, history = minimise(model, start, steps, tolerance)
         return Fitted(model.layout.unpack(root, vector), error, tuple(history))
+
+
+def fit_least_squares(
+    target: Image, mask: Mask, root: Node, *, seed: int = 0, locked: Collection[str] = (), steps: int = 60, count: int = 8000
+) -> Fitted:
+    """Fit the parameters of a tree to a picture: first on coarse averages, then on points of the full picture.
+
+    Args:
+        target: (3, H, H) in [0, 1]. mask: (1, H, H) bool, pixels that count. root: the structure and the start.
+        seed: of the choice of points. locked: addresses that keep their numbers. steps: most steps on each set.
+    Returns:
+        The tree and its mean squared error on the points.
+    """
+    if target.shape[-1] > COARSE_SIZE:
+        root = fit_pixels(Pixels.of(target, mask, COARSE_SIZE), root, locked=locked, steps=steps, softest=COARSE_SOFTNESS).root
+    return fit_pixels(Pixels.important(target, mask, count, seed), root, locked=locked, steps=steps)

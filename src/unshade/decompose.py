@@ -1,0 +1,300 @@
+"""image -> trees: an iterator of improving trees, and fitting a given tree."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from unshade.atoms import Dictionary
+from unshade.errors import PictureError, TreeError, did_you_mean
+from unshade.fit.least_squares import COARSE_SIZE, fit_least_squares
+from unshade.fit.pixels import Pixels
+from unshade.metrics import psnr
+from unshade.nodes import Family, Member, Node, Tree, count_values, find_address
+from unshade.pictures import SphereImage, read_sphere, sphere_from_array
+from unshade.render import render
+from unshade.search import Candidate, Effort, Samples, Search, outline
+from unshade.sphere import sphere_normals
+
+POINTS = 2500
+"""Points of the full picture on which trees grow once they are good."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A point on the curve between speed and quality. Work is counted in steps, so a result never depends on the machine."""
+
+    name: str
+    effort: Effort
+    fine: int
+    """Points on which the result is polished."""
+    members: int
+    """Most trees in the family."""
+    summary: str
+
+    @property
+    def max_values(self) -> int:
+        """Most values a tree may store."""
+        return self.effort.max_values
+
+
+PRESETS = {
+    preset.name: preset
+    for preset in (
+        Preset("draft", Effort(30, beam=0, trials=3, rounds=0, sweeps=0, polish_steps=10), 4000, 6, "at once, 30 values"),
+        Preset("balanced", Effort(64), 8000, 10, "a second or two, 64 values"),
+        Preset("best", Effort(160, trials=5, rounds=4, polish_steps=30), 12000, 16, "several seconds, 160 values"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Step:
+    """An improving tree. ``done`` of ``total`` says how far the work is; ``psnr`` in dB is estimated until the end."""
+
+    tree: Tree
+    psnr: float
+    values: int
+    stage: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a decomposition found: the chosen ``tree``, and the ``family`` from the simplest tree to the most faithful."""
+
+    tree: Tree
+    family: Family
+    psnr: float
+    seed: int
+    preset: str
+
+
+class Decomposition(Iterator[Step]):
+    """The work on one picture. Iterate for improving trees, or ask for the `result` at once.
+
+    >>> import torch
+    >>> picture = torch.full((3, 64, 64), 0.5)
+    >>> decompose(picture, preset="draft").result().tree.leaves
+    1
+    """
+
+    def __init__(self, work: Iterator[Step | Result]) -> None:
+        self._work = work
+        self._last: Step | None = None
+        self._result: Result | None = None
+        self._cancelled = False
+
+    def __next__(self) -> Step:
+        if self._cancelled or self._result is not None:
+            raise StopIteration
+        found = next(self._work)
+        if isinstance(found, Result):
+            self._result = found
+            raise StopIteration
+        self._last = found
+        return found
+
+    def cancel(self) -> None:
+        """Stop after the current step. `result` then holds the best tree so far."""
+        self._cancelled = True
+
+    def result(self) -> Result:
+        """Run to the end and return what was found; after `cancel`, the best so far, its family that tree alone."""
+        for _ in self:
+            pass
+        if self._result is not None:
+            return self._result
+        if self._last is None:
+            raise TreeError("the decomposition was cancelled before its first step")
+        member = Member(self._last.tree, self._last.psnr)
+        return Result(member.tree, Family((member,), 0), member.psnr, -1, "cancelled")
+
+
+def decompose(
+    image: SphereImage | torch.Tensor | Any | str | Path,
+    *,
+    preset: str = "balanced",
+    max_values: int | None = None,
+    seed: int = 0,
+    alternatives: int = 1,
+    search: Literal["size", "depth"] = "size",
+) -> Decomposition:
+    """Decompose a picture of a shaded sphere into a shade tree.
+
+    Args:
+        image: a path, a `SphereImage`, or a (3, H, W) tensor or array in [0, 1].
+        preset: draft, balanced or best.
+        max_values: most values the tree may store, instead of the preset's.
+        seed: of everything drawn at random. The same seed gives the same tree, bit for bit.
+        alternatives: how many structurally different trees of about one size are wanted, the chosen one among them.
+        search: ``size`` grows trees leaf by leaf; ``depth`` is the paper's second stage, structures in order of depth
+            fitted by BasinCMA, and takes minutes.
+    Raises:
+        PictureError: the picture cannot be used. TreeError: an argument is out of range.
+    """
+    if preset not in PRESETS:
+        raise TreeError(f"unknown preset {preset!r}{did_you_mean(preset, PRESETS)}")
+    if max_values is not None and max_values < 3:
+        raise TreeError(f"max_values must be at least 3, the size of one colour, got {max_values}")
+    if alternatives < 1:
+        raise TreeError(f"alternatives must be at least 1, got {alternatives}")
+    if search not in ("size", "depth"):
+        raise TreeError(f"search must be size or depth, got {search!r}")
+    sphere = _sphere(image)
+    chosen = PRESETS[preset]
+    if max_values is not None:
+        chosen = dataclasses.replace(chosen, effort=dataclasses.replace(chosen.effort, max_values=max_values))
+    if search == "depth":
+        return Decomposition(_by_depth(sphere, chosen, seed))
+    return Decomposition(_by_size(sphere, chosen, seed, alternatives))
+
+
+def fit(image: SphereImage | torch.Tensor | Any | str | Path, tree: Tree, *, locked: Collection[str] = (), seed: int = 0) -> Result:
+    """Fit only the parameters of a tree to a picture; the structure stays, and so do ``locked`` addresses or names.
+
+    Raises:
+        PictureError: the picture cannot be used. AddressError: a locked address does not exist.
+    """
+    sphere = _sphere(image)
+    held = {_locked_address(tree.root, where) for where in locked}
+    fitted = fit_least_squares(sphere.image, sphere.valid, tree.root, seed=seed, locked=held)
+    found = dataclasses.replace(tree, root=fitted.root, exposure=sphere.exposure)
+    start, member = _member(sphere, tree.root), Member(found, _psnr(sphere, fitted.root))
+    if start.psnr > member.psnr:
+        member = Member(dataclasses.replace(tree, exposure=sphere.exposure), start.psnr)
+    return Result(member.tree, Family((member,), 0), member.psnr, seed, "fit")
+
+
+def _locked_address(root: Node, where: str) -> str:
+    """A full address for ``ADDRESS`` or ``ADDRESS.parameter``."""
+    from unshade.errors import AddressError
+    from unshade.nodes import KINDS, Leaf, find
+
+    try:
+        return find_address(root, where)
+    except AddressError:
+        head, _, parameter = where.rpartition(".")
+        if not head:
+            raise
+        address = find_address(root, head)
+        node = find(root, address)
+        if not isinstance(node, Leaf):
+            raise
+        return f"{address}.{KINDS[node.kind].parameter(parameter).name}"
+
+
+def _sphere(image: SphereImage | torch.Tensor | Any | str | Path) -> SphereImage:
+    if isinstance(image, SphereImage):
+        sphere = image
+    elif isinstance(image, str | Path):
+        sphere = read_sphere(image)
+    else:
+        sphere = sphere_from_array(image)
+    if int(sphere.valid.sum()) < 16:
+        raise PictureError(f"only {int(sphere.valid.sum())} pixels of the sphere count; at least 16 are needed, so ignore fewer")
+    return sphere
+
+
+def _psnr(sphere: SphereImage, tree: Tree | Node) -> float:
+    rendered = render(tree, sphere_normals(sphere.size))
+    return psnr(rendered, sphere.image, sphere.valid)
+
+
+def _member(sphere: SphereImage, root: Node) -> Member:
+    return Member(Tree(root, exposure=sphere.exposure), _psnr(sphere, root))
+
+
+def _decibels(error: float) -> float:
+    return -10.0 * math.log10(max(error, 1e-10))
+
+
+@lru_cache(maxsize=4)
+def _dictionary(key: tuple[int, ...]) -> list[Dictionary]:
+    """A cell for the dictionary of one set of normals; all pictures of one size and mask share it."""
+    return []
+
+
+def _shared_dictionary(pixels: Pixels) -> Dictionary:
+    normals = pixels.normals
+    cell = _dictionary((normals.shape[1], hash(normals.numpy().tobytes())))
+    if not cell:
+        cell.append(Dictionary(normals))
+    return cell[0]
+
+
+def _samples(sphere: SphereImage, preset: Preset, seed: int) -> Samples:
+    coarse = Pixels.of(sphere.image, sphere.valid, COARSE_SIZE)
+    points = Pixels.points(sphere.image, sphere.valid, POINTS, seed)
+    fine = Pixels.important(sphere.image, sphere.valid, preset.fine, seed)
+    return Samples(coarse, points, fine, _shared_dictionary(coarse), _shared_dictionary(points))
+
+
+def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int) -> Iterator[Step | Result]:
+    samples = _samples(sphere, preset, seed)
+    total = preset.effort.max_values * alternatives
+    done = 0
+    searches = []
+    for number in range(alternatives):
+        search = Search(samples, preset.effort, skip=number)
+        found: Candidate | None = None
+        for stage, found in search.run():
+            done = min(max(done, number * preset.effort.max_values + found.values), total - 1)
+            yield Step(Tree(found.root, exposure=sphere.exposure), _decibels(found.error), found.values, stage, done, total)
+        assert found is not None
+        searches.append((search, found))
+    search, found = searches[0]
+    chosen = _member(sphere, found.root)
+    members = [member for member in search.family(preset.members) if count_values(member.root) < chosen.values]
+    curve = [_member(sphere, member.root) for member in members]
+    curve = [member for k, member in enumerate(curve) if member.psnr < chosen.psnr and all(member.psnr > other.psnr for other in curve[:k])]
+    others = _alternatives(sphere, chosen, [candidate for _, candidate in searches[1:]])
+    family = Family((*curve, chosen), len(curve), tuple(others))
+    yield Step(chosen.tree, chosen.psnr, chosen.values, "done", total, total)
+    yield Result(chosen.tree, family, chosen.psnr, seed, preset.name)
+
+
+def _alternatives(sphere: SphereImage, chosen: Member, candidates: list[Candidate]) -> list[Member]:
+    """Those of other structure than the chosen tree and than one another."""
+    seen = {outline(chosen.tree.root)}
+    others = []
+    for candidate in candidates:
+        if outline(candidate.root) not in seen:
+            seen.add(outline(candidate.root))
+            others.append(_member(sphere, candidate.root))
+    return others
+
+
+def _by_depth(sphere: SphereImage, preset: Preset, seed: int) -> Iterator[Step | Result]:
+    """The paper's second stage: structures in order of depth, BasinCMA, then the whole tree."""
+    from unshade import search_depth
+    from unshade.fit.basin_cma import fit_basin_cma
+    from unshade.fit.gradient import fit_gradient
+
+    best: Member | None = None
+    members: list[Member] = []
+    for progress in search_depth.search(
+        sphere.image,
+        sphere.valid,
+        partial(fit_basin_cma, objective="l2", meta_steps=6, gradient_steps=10, final_steps=150),
+        0.01,
+        seed=seed,
+        rank=partial(fit_gradient, size=20, steps=50, restarts=3),
+        whole_tree=partial(fit_gradient, restarts=1),
+        max_values=preset.max_values,
+    ):
+        member = _member(sphere, progress.root)
+        if best is None or member.psnr > best.psnr:
+            best = member
+            members = [other for other in members if other.values < member.values] + [member]
+        yield Step(best.tree, best.psnr, best.values, progress.stage, progress.done, progress.total)
+    assert best is not None
+    yield Result(best.tree, Family(tuple(members), len(members) - 1), best.psnr, seed, preset.name)

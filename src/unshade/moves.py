@@ -1,0 +1,279 @@
+"""How a tree can grow by one leaf: every place times every entry of the dictionary, with the gain each would bring.
+
+With the rest of the tree fixed, a node's value X enters the picture as ``a + A X``. Putting a leaf beside it gives
+
+- light:  ``screen(X, c h)``          changes the picture by ``A (1 - X) h c``,
+- paint:  ``mix(X, albedo(c), 1 - m)`` by ``A m (c - X)``,
+- shade:  ``multiply(X, k + (1 - k) d)`` by ``A X (d - 1) (1 - k)``,
+
+each linear in one colour or strength, so the best one and what it saves are closed forms for all entries at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import torch
+
+from unshade.atoms import Atoms, Dictionary
+from unshade.fit.least_squares import Model
+from unshade.nodes import KINDS, Leaf, Node, Operator, Role, count_values, find, leaf, mix, multiply, replace, screen, tint, walk
+
+
+@dataclass(frozen=True)
+class Move:
+    """A grown tree, how much squared error it should save before any refitting, and what it costs."""
+
+    root: Node
+    family: str
+    where: str
+    gain: float
+    cost: int
+    relative: float
+    """log(error before / error after) a stored value."""
+
+
+@dataclass(frozen=True)
+class _Place:
+    address: str
+    node: Node
+    value: torch.Tensor
+    gain: torch.Tensor
+
+
+def add_light(node: Node, light: Node) -> Node:
+    """``screen(node, light)``, flat."""
+    if isinstance(node, Operator) and node.kind == "screen":
+        return dataclasses.replace(node, children=(*node.children, light))
+    return screen(node, light)
+
+
+def add_shade(node: Node, shade: Node) -> Node:
+    """``multiply(node, shade)``, flat, but a tint stays a pair."""
+    if isinstance(node, Operator) and node.kind == "multiply" and tint(node) is None:
+        return dataclasses.replace(node, children=(*node.children, shade))
+    if isinstance(node, Operator) and node.kind == "multiply" and KINDS[tint(node)[1].kind].role is Role.DIFFUSE:  # type: ignore[index]
+        return dataclasses.replace(node, children=(*node.children, shade))
+    return multiply(node, shade)
+
+
+def is_paint(node: Node) -> bool:
+    """An albedo, or albedos mixed by masks."""
+    if isinstance(node, Leaf):
+        return node.kind == "albedo"
+    return node.kind == "mix" and all(is_paint(child) for child in node.children)
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """Where the parts of a tree are that the search grows: ``mix(edge, screen(multiply(paint, form...), lights...))``.
+
+    Growing only here keeps a tree readable: colour and form stand in the base, lights are screened on top of it, and only
+    drawn edges lie over the whole.
+    """
+
+    canvas: str
+    """What lights are screened onto."""
+    base: str
+    """Paint times form."""
+    paints: tuple[str, ...]
+    """The albedos of the base."""
+    forms: tuple[str, ...]
+    """The grey factors of the base."""
+
+    @staticmethod
+    def of(root: Node) -> Anatomy:
+        """Find the parts of a tree; any tree has a canvas and a base, perhaps the root itself."""
+        address, node = root.kind, root
+        while isinstance(node, Operator) and node.kind == "mix" and not is_paint(node) and is_paint(node.children[0]):
+            address, node = f"{address}.1.{node.children[1].kind}", node.children[1]
+        canvas = address
+        if isinstance(node, Operator) and node.kind == "screen":
+            address, node = f"{address}.0.{node.children[0].kind}", node.children[0]
+        base = address
+        factors = [(address, node)]
+        if isinstance(node, Operator) and node.kind == "multiply":
+            factors = [(f"{address}.{k}.{child.kind}", child) for k, child in enumerate(node.children)]
+        paints = tuple(
+            f"{where}{below[len(part.kind) :]}" for where, part in factors if is_paint(part) for below, leaf in walk(part) if leaf.kind == "albedo"
+        )
+        forms = tuple(where for where, part in factors if not is_paint(part)) if len(factors) > 1 else ()
+        return Anatomy(canvas, base, paints, forms)
+
+
+def complement(mask: Leaf) -> Leaf | None:
+    """The threshold mask that is 1 where this one is 0."""
+    if mask.kind != "threshold":
+        return None
+    return mask.set(direction=[-x for x in mask["direction"]], threshold=-mask["threshold"][0])  # type: ignore[union-attr, operator, index]
+
+
+class Proposer:
+    """Scores the dictionary against a fitted tree."""
+
+    def __init__(self, dictionary: Dictionary, target: torch.Tensor, weight: torch.Tensor) -> None:
+        self.dictionary, self.target, self.weight = dictionary, target, weight
+
+    def propose(self, model: Model, vector: torch.Tensor, families: Collection[str], best: int) -> list[Move]:
+        """The most promising moves, best first, at most two of one family at one place."""
+        root = model.layout.unpack(model.root, vector)
+        values = model.evaluate(vector)
+        residual = self.target - model.compose(values)
+        self.error = float((residual.square() * self.weight).sum()) / 3.0
+        self.size = count_values(root)
+        count = residual.shape[1]
+        known = {
+            address: _Place(address, node, value.expand(3, count), torch.as_tensor(gain, dtype=residual.dtype).expand(3, count))
+            for address, node, value, gain in model.nodes(values)
+        }
+        parts = Anatomy.of(root)
+        found: list[Move] = []
+        for family in families:
+            if family in ("lights", "plain_lights", "spots", "environments"):
+                found += self._lights(root, known[parts.canvas], residual, family, grey_only=False)
+                if family in ("lights", "spots"):
+                    for where in parts.forms[:1]:
+                        found += self._lights(root, known[where], residual, family, grey_only=True)
+            elif family in ("masks", "plain_masks"):
+                for where in dict.fromkeys(((root.kind,) if family == "masks" else ()) + parts.paints):
+                    found += self._paints(root, known[where], residual, family)
+            else:
+                found += self._shades(root, known[parts.base], residual, family)
+        found.sort(key=lambda move: -move.relative)
+        taken: dict[tuple[str, str], int] = {}
+        chosen = []
+        for move in found:
+            key = (move.family, move.where)
+            if taken.get(key, 0) < 2:
+                taken[key] = taken.get(key, 0) + 1
+                chosen.append(move)
+        return chosen[:best]
+
+    def _best(self, atoms: Atoms, score: torch.Tensor, how_many: int) -> list[int]:
+        return torch.topk(score, min(how_many, len(atoms.leaves))).indices.tolist()
+
+    def _lights(self, root: Node, place: _Place, residual: torch.Tensor, family: str, grey_only: bool) -> list[Move]:
+        atoms = self.dictionary[family]
+        basis = place.gain * (1.0 - place.value)
+        up = (self.weight * basis * residual) @ atoms.pictures.T  # (3, M)
+        down = (self.weight * basis.square()) @ atoms.squares.T
+        moves = []
+        color = (up / down.clamp(min=1e-12)).clamp(0.0, 1.0)
+        saved = (2.0 * color * up - color.square() * down).sum(0) / 3.0
+        grey = torch.where(atoms.scalable, (up.sum(0) / down.sum(0).clamp(min=1e-12)).clamp(0.0, 1.0), torch.ones(()))
+        saved_grey = (2.0 * grey * up.sum(0) - grey.square() * down.sum(0)) / 3.0
+        if not grey_only:
+            for k in self._best(atoms, saved, 2):
+                shade = tuple(color[:, k].tolist())
+                entry = atoms.leaves[k]
+                light = entry.set(color=shade) if family == "environments" else multiply(leaf("albedo", color=shade), entry)
+                moves.append(self._move(root, place, add_light(place.node, light), f"tinted {family}", float(saved[k])))
+        if family != "environments":
+            for k in self._best(atoms, saved_grey, 2):
+                entry = atoms.leaves[k]
+                amplitude = KINDS[entry.kind].amplitude
+                light = entry.set(**{amplitude: float(grey[k])}) if amplitude else entry
+                moves.append(self._move(root, place, add_light(place.node, light), f"grey {family}", float(saved_grey[k])))
+        return moves
+
+    def _paints(self, root: Node, place: _Place, residual: torch.Tensor, family: str) -> list[Move]:
+        atoms = self.dictionary[family]
+        # the picture changes by A m (c - X): least squares in c of (residual + A m X) - A m c
+        gain, value = place.gain, place.value
+        squares_gain = (self.weight * gain.square()) @ atoms.squares.T
+        cross = (self.weight * gain * residual) @ atoms.pictures.T + (self.weight * gain.square() * value) @ atoms.squares.T
+        color = (cross / squares_gain.clamp(min=1e-12)).clamp(0.0, 1.0)
+        constant = 2.0 * ((self.weight * gain * residual * value) @ atoms.pictures.T) + (self.weight * (gain * value).square()) @ atoms.squares.T
+        saved = (2.0 * color * cross - color.square() * squares_gain - constant).sum(0) / 3.0
+        moves = []
+        for k in self._best(atoms, saved, 3):
+            paint = leaf("albedo", color=tuple(color[:, k].tolist()))
+            moves.append(self._move(root, place, mix(paint, place.node, atoms.leaves[k]), family, float(saved[k])))
+        return moves
+
+    def _shades(self, root: Node, place: _Place, residual: torch.Tensor, family: str) -> list[Move]:
+        atoms = self.dictionary[family]
+        basis = place.gain * place.value
+        # picture changes by basis (d - 1) t with t = 1 - ambient
+        first = self.weight * basis * residual
+        second = self.weight * basis.square()
+        up = (first.sum(0) @ atoms.pictures.T) - first.sum()
+        down = second.sum(0) @ atoms.squares.T - 2.0 * (second.sum(0) @ atoms.pictures.T) + second.sum()
+        strength = (up / down.clamp(min=1e-12)).clamp(0.0, 1.0)
+        saved = (2.0 * strength * up - strength.square() * down) / 3.0
+        moves = []
+        for k in self._best(atoms, saved, 2):
+            shade = atoms.leaves[k].set(ambient=1.0 - float(strength[k]))
+            moves.append(self._move(root, place, add_shade(place.node, shade), family, float(saved[k])))
+        return moves
+
+    def _move(self, root: Node, place: _Place, node: Node, family: str, gain: float) -> Move:
+        grown = replace(root, place.address, node)
+        cost = count_values(grown) - self.size
+        after = max(self.error - gain, 1e-3 * self.error)
+        relative = float(torch.tensor(self.error / after).log()) / max(cost, 1)
+        return Move(grown, family, place.address, gain, cost, relative)
+
+
+def removals(root: Node) -> list[Node]:
+    """Every tree that has one light, form or paint less."""
+    parts = Anatomy.of(root)
+    found = []
+    for address, node in walk(root):
+        parent = address.rsplit(".", 2)
+        if len(parent) == 3 and parent[2] != "mask" and parent[0].rpartition(".")[2] in ("screen", "multiply"):
+            inside_pair = tint(find(root, parent[0])) is not None and parent[0] != parts.base
+            if address != parts.base and not inside_pair and not (is_paint(node) and parent[0] == parts.base):
+                found.append(replace(root, address, None))
+        if isinstance(node, Operator) and node.kind == "mix":
+            found += [replace(root, address, child) for child in node.children]
+    return found
+
+
+def swaps(root: Node) -> list[Node]:
+    """Every tree in which one leaf has another kind, or a light has lost or found its colour."""
+    found = []
+    for address, node in walk(root):
+        pair = tint(node)
+        if pair and pair[1].kind == "rim":
+            found.append(replace(root, address, pair[1]))
+        if pair and KINDS[pair[1].kind].amplitude:
+            grey = sum(pair[0]["color"]) / 3.0  # type: ignore[arg-type]
+            found.append(replace(root, address, pair[1].set(**{KINDS[pair[1].kind].amplitude: min(grey, 1.0)})))  # type: ignore[dict-item]
+        if not isinstance(node, Leaf):
+            continue
+        for other in _relatives(node):
+            found.append(replace(root, address, other))
+        amplitude = KINDS[node.kind].amplitude
+        parent = address.rsplit(".", 2)
+        if amplitude and len(parent) == 3 and parent[0].rpartition(".")[2] == "screen":
+            strength = min(node[amplitude][0], 1.0)  # type: ignore[operator]
+            found.append(replace(root, address, multiply(leaf("albedo", color=(strength,) * 3), node.set(**{amplitude: 1.0}))))
+    return found
+
+
+def _relatives(node: Leaf) -> list[Leaf]:
+    """The same light, form or mask as the kinds next to it."""
+    direction = node["direction"] if node.kind not in ("albedo", "image", "image_mask", "environment_map") else None
+    match node.kind:
+        case "highlight":
+            sharpness, amplitude = node["sharpness"][0], node["amplitude"][0]  # type: ignore[index]
+            radius = min(0.8 / math.sqrt(sharpness), 1.5)
+            return [leaf("toon_highlight", direction=direction, radius=radius, brightness=min(amplitude, 1.0), softness=min(radius, 2.0))]
+        case "toon_highlight":
+            sharpness = min(max(0.7 / max(node["radius"][0], 0.01) ** 2, 0.1), 2000.0)  # type: ignore[operator]
+            return [leaf("highlight", direction=direction, sharpness=sharpness, amplitude=node["brightness"][0])]
+        case "diffuse":
+            return [leaf("toon_diffuse", direction=direction, ambient=node["ambient"][0], threshold=-0.2, softness=1.3)]
+        case "toon_diffuse":
+            return [leaf("diffuse", direction=direction, ambient=node["ambient"][0])]
+        case "stripe":
+            edge = node["center"][0] - 0.5 * node["width"][0]  # type: ignore[operator]
+            return [leaf("threshold", direction=direction, threshold=edge, softness=node["softness"][0])]
+        case "threshold":
+            return [leaf("stripe", direction=direction, center=min(node["threshold"][0] + 0.5, 1.0), width=1.0, softness=node["softness"][0])] if abs(node["threshold"][0]) < 0.9 else []  # type: ignore[operator, arg-type]
+        case _:
+            return []

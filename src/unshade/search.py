@@ -1,0 +1,325 @@
+"""Search over structures by size: grow a tree leaf by leaf where it pays most, then prune, swap and polish.
+
+One picture, three sets of its pixels: coarse averages, on which trees grow fast and textures do not mislead; points of the
+full picture, on which edges are exact; and more points, on which the result is polished. Work is counted in steps, never
+in seconds, so that a result depends on nothing but the picture, the preset and the seed.
+
+A tree is judged by ``log(error + floor) + price * values``: every stored value has to lower the error by a share, and an
+error below what 8-bit pictures can show is not worth lowering.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
+
+import torch
+
+from unshade.atoms import Dictionary
+from unshade.fit.fitted import Fitted
+from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, Model, fit_pixels
+from unshade.fit.pixels import Pixels
+from unshade.moves import Move, Proposer, removals, swaps
+from unshade.nodes import Leaf, Node, count_values, leaf, replace, walk
+
+PLAIN = ("plain_lights", "plain_masks", "plain_shades", "spots")
+DRAWN = 1.0e-5
+"""A plain tree with a mean squared error under this one is the answer: the picture was drawn with such a tree."""
+
+PHOTOGRAPHIC = 1.0e-3
+"""A plain tree over this error is given up: the picture was not drawn with one."""
+
+FLOOR = 2.0e-6
+"""Mean squared error that is not worth lowering: rounding to 8 bits alone makes 1.3e-6."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much work a search does, in steps."""
+
+    max_values: int
+    price: float = 0.006
+    """Least decrease of log(error) that a stored value must bring."""
+    beam: int = 5
+    beam_moves: int = 6
+    trials: int = 4
+    """Moves that are tried by a short fit at each growth."""
+    trial_steps: int = 5
+    growth_steps: int = 12
+    rounds: int = 2
+    """Times that the least useful leaf is taken out and the tree grown again."""
+    sweeps: int = 1
+    """Times that all leaves are offered other kinds."""
+    sweep_steps: int = 12
+    """Most changes a sweep makes."""
+    polish_steps: int = 25
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A tree on the way, with its mean squared error on the polishing points (or the set it was grown on)."""
+
+    root: Node
+    error: float
+
+    @property
+    def values(self) -> int:
+        """Stored values."""
+        return count_values(self.root)
+
+
+@dataclass
+class Front:
+    """The best tree of each size so far."""
+
+    best: dict[int, Candidate] = field(default_factory=dict)
+
+    def add(self, candidate: Candidate) -> None:
+        """Keep it if no tree of its size is better."""
+        held = self.best.get(candidate.values)
+        if held is None or candidate.error < held.error:
+            self.best[candidate.values] = candidate
+
+    def members(self) -> list[Candidate]:
+        """Smallest first, each better than all that are smaller."""
+        chosen: list[Candidate] = []
+        for values in sorted(self.best):
+            if not chosen or self.best[values].error < 0.98 * chosen[-1].error:
+                chosen.append(self.best[values])
+        return chosen
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The pixel sets of one picture with their dictionaries."""
+
+    coarse: Pixels
+    points: Pixels
+    fine: Pixels
+    coarse_dictionary: Dictionary
+    points_dictionary: Dictionary
+
+
+class Search:
+    """One search. `run` yields better and better candidates; `front` holds the curve."""
+
+    def __init__(self, samples: Samples, effort: Effort, families: tuple[str, ...] = ("lights", "masks", "shades", "spots", "environments"), skip: int = 0) -> None:
+        self.samples, self.effort, self.families, self.skip = samples, effort, families, skip
+        self.front = Front()
+        """Trees that were fitted to points of the full picture."""
+        self.rough = Front()
+        """Trees that were fitted to the coarse averages only."""
+
+    def family(self, most: int) -> list[Candidate]:
+        """The curve of error over values: at most ``most`` trees of all sizes that the search came by, polished."""
+        known = {candidate.values: candidate for candidate in (*self.rough.members(), *self.front.members())}
+        sizes = sorted(known)
+        if len(sizes) > most:
+            sizes = sorted({sizes[round(k * (len(sizes) - 1) / (most - 1))] for k in range(most)})
+        with torch.no_grad():
+            return [self._fit(known[values].root, self.samples.points, self.effort.growth_steps) for values in sizes]
+
+    def judge(self, error: float, values: int) -> float:
+        """Lower is better."""
+        return math.log(error + FLOOR) + self.effort.price * values
+
+    def run(self) -> Iterator[tuple[str, Candidate]]:
+        """(stage, candidate) as they come; the last one is the result."""
+        with torch.no_grad():
+            if self.effort.beam and not self.skip:
+                plain = yield from self._plain()
+                if plain.error < DRAWN:
+                    yield "polish", plain
+                    return
+            current = Candidate(self._start(), math.inf)
+            for current in self._grow(current, self.samples.coarse, self.samples.coarse_dictionary, stop=1e-4):
+                yield "grow", current
+            current = self._fit(current.root, self.samples.points, self.effort.growth_steps)
+            for current in self._grow(current, self.samples.points, self.samples.points_dictionary, stop=FLOOR):
+                yield "grow", current
+            for _ in range(self.effort.sweeps):
+                current = self._sweep(current, self.samples.points)
+                yield "swap", current
+            for number in range(self.effort.rounds):
+                better = self._exchange(current, number)
+                if self.judge(better.error, better.values) < self.judge(current.error, current.values):
+                    current = better
+                    yield "exchange", current
+            yield "polish", self._polish(current)
+
+    def _plain(self) -> Generator[tuple[str, Candidate], None, Candidate]:
+        """Beam search with only the words of the released grammar, which a drawn or sampled picture may be made of."""
+        effort, pixels = self.effort, self.samples.coarse
+        proposer = Proposer(self.samples.coarse_dictionary, pixels.target, pixels.weight)
+        states = self._forms(proposer)
+        best, stale = min(states, key=self._drawn), 0
+        while stale < 2:
+            options: list[Candidate] = []
+            for state in states:
+                model = Model(state.root, pixels)
+                moves = proposer.propose(model, model.layout.pack(state.root), PLAIN, effort.beam_moves)
+                options += [self._coarse(move.root, effort.trial_steps) for move in moves if move.cost <= effort.max_values - state.values]
+            states = [self._coarse(option.root, 8) for option in distinct(sorted(options, key=self._drawn), effort.beam, each=2)]
+            if not states:
+                break
+            leader = min(states, key=self._drawn)
+            best, stale = (leader, 0) if self._drawn(leader) < self._drawn(best) else (best, stale + 1)
+            yield "plain", best
+        sharp = self._sharpen(best)
+        if sharp.error > PHOTOGRAPHIC:
+            return sharp
+        for _ in range(2):
+            before = sharp
+            for sharp in self._grow(self._fit(sharp.root, self.samples.points, effort.growth_steps), self.samples.points, self.samples.points_dictionary, FLOOR, PLAIN):
+                yield "plain", sharp
+            sharp = self._sharpen(self._sweep(self._sharpen(sharp), self.samples.fine))
+            yield "plain", sharp
+            if sharp.error < DRAWN or sharp.error > 0.7 * before.error:
+                break
+        return sharp
+
+    def _drawn(self, candidate: Candidate) -> float:
+        """How a plain tree is judged while it grows: a dearer price than `judge`'s keeps small trees in the beam."""
+        return math.log(candidate.error + FLOOR) + 5.0 * self.effort.price * candidate.values
+
+    def _coarse(self, root: Node, steps: int) -> Candidate:
+        fitted = fit_pixels(self.samples.coarse, root, steps=steps, tolerance=1e-3, softest=COARSE_SOFTNESS)
+        candidate = Candidate(fitted.root, fitted.error)
+        self.rough.add(candidate)
+        return candidate
+
+    def _forms(self, proposer: Proposer) -> list[Candidate]:
+        """Where plain trees start: one colour, alone and under one or two shadings."""
+        flat = self._coarse(self._start(), 2)
+        found = layer = [flat]
+        for _ in range(2):
+            options: list[Candidate] = []
+            for state in layer:
+                model = Model(state.root, self.samples.coarse)
+                moves = proposer.propose(model, model.layout.pack(state.root), ("plain_shades",), 6)
+                options += [self._coarse(move.root, 10) for move in moves]
+            layer = distinct(sorted(options, key=lambda option: option.error), 6, each=3)
+            found = found + layer
+        return found
+
+    def _sharpen(self, current: Candidate) -> Candidate:
+        """Fit on the fine points with edges about a pixel wide, then make edges hard where that is no worse."""
+        fitted = fit_pixels(self.samples.fine, current.root, steps=self.effort.polish_steps, softest=FINE_SOFTNESS)
+        hard = harden(fitted.root, 2.0 * FINE_SOFTNESS)
+        if hard is not fitted.root:
+            model = Model(hard, self.samples.fine)
+            values = model.evaluate(model.layout.pack(hard))
+            error = float(((model.compose(values) - self.samples.fine.target).square() * self.samples.fine.weight).sum()) / 3.0
+            if error < fitted.error:
+                return Candidate(hard, error)
+        return Candidate(fitted.root, fitted.error)
+
+    def _start(self) -> Node:
+        pixels = self.samples.coarse
+        mean = (pixels.target * pixels.weight).sum(1).clamp(0.0, 1.0)
+        return leaf("albedo", color=mean.tolist())
+
+    def _fit(self, root: Node, pixels: Pixels, steps: int, tolerance: float = 1e-3) -> Candidate:
+        fitted: Fitted = fit_pixels(pixels, root, steps=steps, tolerance=tolerance, softest=FINE_SOFTNESS if pixels is not self.samples.coarse else COARSE_SOFTNESS)
+        candidate = Candidate(fitted.root, fitted.error)
+        (self.rough if pixels is self.samples.coarse else self.front).add(candidate)
+        return candidate
+
+    def _grow(
+        self, current: Candidate, pixels: Pixels, dictionary: Dictionary, stop: float, families: tuple[str, ...] | None = None
+    ) -> Iterator[Candidate]:
+        """Add the leaf that pays most, again and again."""
+        proposer = Proposer(dictionary, pixels.target, pixels.weight)
+        effort = self.effort
+        while True:
+            model = Model(current.root, pixels)
+            moves = proposer.propose(model, model.layout.pack(current.root), families or self.families, 24)
+            room = effort.max_values - count_values(current.root)
+            moves = [move for move in moves if move.cost <= room and move.relative > 0.0]
+            if proposer.error <= stop or not moves:
+                return
+            if self.skip:
+                moves = moves[self.skip :] or moves
+                self.skip = 0
+            grown = self._try(moves, pixels, proposer.error)
+            if grown is None:
+                return
+            current = grown
+            yield current
+
+    def _try(self, moves: list[Move], pixels: Pixels, error: float) -> Candidate | None:
+        """Short fits of the most promising moves; a full one of the best, if it pays."""
+        best: tuple[float, Node] | None = None
+        for move in moves[: self.effort.trials]:
+            fitted = fit_pixels(pixels, move.root, steps=self.effort.trial_steps, softest=FINE_SOFTNESS)
+            pays = math.log((error + FLOOR) / (fitted.error + FLOOR)) / max(move.cost, 1)
+            if best is None or pays > best[0]:
+                best = (pays, fitted.root)
+        if best is None or best[0] < self.effort.price:
+            return None
+        return self._fit(best[1], pixels, self.effort.growth_steps)
+
+    def _sweep(self, current: Candidate, pixels: Pixels) -> Candidate:
+        """Offer every leaf another kind, or none at all, until nothing pays. Never makes a tree larger."""
+        current = self._fit(current.root, pixels, self.effort.growth_steps)
+        for _ in range(self.effort.sweep_steps):
+            score = self.judge(current.error, current.values)
+            options = []
+            for root in removals(current.root) + swaps(current.root):
+                if count_values(root) <= current.values:
+                    quick = fit_pixels(pixels, root, steps=4, softest=FINE_SOFTNESS)
+                    options.append(Candidate(quick.root, quick.error))
+            options.sort(key=lambda option: self.judge(option.error, option.values))
+            tried = [self._fit(option.root, pixels, self.effort.growth_steps) for option in options[:3]]
+            best = min(tried, key=lambda option: self.judge(option.error, option.values), default=current)
+            if self.judge(best.error, best.values) > score - 1e-4:
+                return current
+            current = best
+        return current
+
+    def _exchange(self, current: Candidate, number: int) -> Candidate:
+        """Take out the leaf whose loss hurts least (the next one each time) and grow again."""
+        pixels = self.samples.points
+        options = []
+        for root in removals(current.root):
+            quick = fit_pixels(pixels, root, steps=3, softest=FINE_SOFTNESS)
+            options.append((self.judge(quick.error, count_values(root)), quick.root))
+        options.sort(key=lambda option: option[0])
+        if not options:
+            return current
+        smaller = self._fit(options[min(number, len(options) - 1)][1], pixels, self.effort.growth_steps)
+        for smaller in self._grow(smaller, pixels, self.samples.points_dictionary, FLOOR):
+            pass
+        return smaller
+
+    def _polish(self, current: Candidate) -> Candidate:
+        return self._sharpen(current)
+
+
+def distinct(candidates: list[Candidate], most: int, each: int = 1) -> list[Candidate]:
+    """The first candidates, at most ``each`` of one structure."""
+    seen: dict[str, int] = {}
+    chosen = []
+    for candidate in candidates:
+        key = outline(candidate.root)
+        seen[key] = seen.get(key, 0) + 1
+        if seen[key] <= each:
+            chosen.append(candidate)
+    return chosen[:most]
+
+
+def outline(root: Node) -> str:
+    """The structure of a tree as text, numbers left out."""
+    if isinstance(root, Leaf):
+        return root.kind
+    below = ",".join(outline(child) for child in root.children)
+    return f"{root.kind}({below}{'|' + root.mask.kind if root.mask else ''})"
+
+
+def harden(root: Node, softest: float) -> Node:
+    """The tree with every edge of about a pixel made hard."""
+    for address, node in walk(root):
+        if isinstance(node, Leaf) and node.kind in ("threshold", "stripe", "toon_highlight") and node["softness"][0] <= softest:  # type: ignore[operator]
+            root = replace(root, address, node.set(softness=0.0))
+    return root
