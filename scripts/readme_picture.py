@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
+
 from unshade.decompose import decompose
 from unshade.metrics import psnr
-from unshade.pictures import read_sphere
-
 from unshade.nodes import Leaf, Node, Role, Tree, count_values, steps, tint
 from unshade.parameters import Layout
+from unshade.pictures import read_sphere
 from unshade.render import evaluate, render
 from unshade.sphere import disc_mask, sphere_normals
 
@@ -90,9 +90,12 @@ def draw(image: torch.Tensor, tree: Tree, error: float) -> Image.Image:
     for box in boxes:
         box.x, box.y = round(box.x), round(MARGIN + THUMBNAIL / 2 + box.y * spread)
     for box in boxes:
+        if box.below:
+            middle = (box.y + box.below[0].y) // 2
+            pen.line([(box.x, box.y), (box.x, middle)], LINE, 2)
+            pen.line([(box.below[0].x, middle), (box.below[-1].x, middle)], LINE, 2)
         for child in box.below:
-            middle = (box.y + child.y) // 2
-            pen.line([(box.x, box.y), (box.x, middle), (child.x, middle), (child.x, child.y)], LINE, 2)
+            pen.line([(child.x, middle), (child.x, child.y)], LINE, 2)
     for box in boxes:
         thumbnail = picture(shown(box.node), THUMBNAIL)
         corner = (int(box.x - THUMBNAIL / 2), int(box.y - THUMBNAIL / 2))
