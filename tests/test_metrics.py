@@ -71,7 +71,11 @@ def test_figures_fall_with_noise() -> None:
 
 
 def test_shapes_are_checked() -> None:
-    for a, b in ((torch.zeros(3, 8, 9), torch.zeros(3, 8, 9)), (torch.zeros(3, 8, 8), torch.zeros(3, 9, 9)), (torch.zeros(8, 8), torch.zeros(8, 8))):
+    for a, b in (
+        (torch.zeros(3, 8, 9), torch.zeros(3, 8, 9)),
+        (torch.zeros(3, 8, 8), torch.zeros(3, 9, 9)),
+        (torch.zeros(8, 8), torch.zeros(8, 8)),
+    ):
         with pytest.raises(ValueError, match="expected"):
             metrics.psnr(a, b)
     with pytest.raises(ValueError, match="no pixel"):

@@ -140,7 +140,7 @@ def no_sphere(kind: str) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["noise", "wide noise", "landscape", "flat, not square", "text", "rectangle"])
 def test_a_picture_without_a_sphere_says_what_to_do(tmp_path: Path, kind: str) -> None:
     path = save(tmp_path / "nothing.png", no_sphere(kind))
-    with pytest.raises(PictureError, match="no sphere found.*--disc cx,cy,r"):
+    with pytest.raises(PictureError, match=r"no sphere found.*--disc cx,cy,r"):
         read_sphere(path)
     assert read_sphere(path, disc=(50, 50, 40)).disc == Disc(50, 50, 40, 1.0)
 
@@ -234,8 +234,23 @@ def test_sixteen_bit_png_keeps_every_bit(tmp_path: Path, channels: int) -> None:
 @pytest.mark.parametrize("order", "<>")
 def test_sixteen_bit_tiff_keeps_every_bit(tmp_path: Path, order: str) -> None:
     values = np.random.default_rng(1).integers(0, 65536, (10, 11, 3)).astype(order + "u2")
-    entries = [(256, 3, 1, 11), (257, 3, 1, 10), (258, 3, 3, 8), (259, 3, 1, 1), (262, 3, 1, 2), (273, 4, 1, 14), (277, 3, 1, 3), (278, 3, 1, 10), (279, 4, 1, 660)]
-    data = (b"II" if order == "<" else b"MM") + struct.pack(order + "HI", 42, 14 + 660) + struct.pack(order + "HHH", 16, 16, 16) + values.tobytes()
+    entries = [
+        (256, 3, 1, 11),
+        (257, 3, 1, 10),
+        (258, 3, 3, 8),
+        (259, 3, 1, 1),
+        (262, 3, 1, 2),
+        (273, 4, 1, 14),
+        (277, 3, 1, 3),
+        (278, 3, 1, 10),
+        (279, 4, 1, 660),
+    ]
+    data = (
+        (b"II" if order == "<" else b"MM")
+        + struct.pack(order + "HI", 42, 14 + 660)
+        + struct.pack(order + "HHH", 16, 16, 16)
+        + values.tobytes()
+    )
     data += struct.pack(order + "H", len(entries))
     for tag, kind, count, value in entries:
         packed = struct.pack(order + "HH", value, 0) if kind == 3 and count == 1 else struct.pack(order + "I", value)
@@ -285,7 +300,9 @@ def rgb_profile(primaries: color_profiles.Chromaticities, gamma: float) -> bytes
     curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(gamma * 256)) + b"\0\0"
     text = b"desc\0\0\0\0" + struct.pack(">I", 5) + b"test\0" + b"\0" * 79
     tags = [(b"desc", text), (b"wtpt", xyz(np.array([0.96422, 1.0, 0.82521])))]
-    tags += [(name, xyz(matrix[:, k])) for k, name in enumerate((b"rXYZ", b"gXYZ", b"bXYZ"))] + [(name, curve) for name in (b"rTRC", b"gTRC", b"bTRC")]
+    tags += [(name, xyz(matrix[:, k])) for k, name in enumerate((b"rXYZ", b"gXYZ", b"bXYZ"))] + [
+        (name, curve) for name in (b"rTRC", b"gTRC", b"bTRC")
+    ]
     table, body = b"", b""
     for name, data in tags:
         data += b"\0" * (-len(data) % 4)
@@ -293,7 +310,14 @@ def rgb_profile(primaries: color_profiles.Chromaticities, gamma: float) -> bytes
         body += data
     size = 132 + len(table) + len(body)
     white = struct.pack(">3i", 63190, 65536, 54061)
-    header = struct.pack(">I4sI4s4s4s", size, b"\0" * 4, 0x02400000, b"mntr", b"RGB ", b"XYZ ") + b"\0" * 12 + b"acsp" + b"\0" * 28 + white + b"\0" * 48
+    header = (
+        struct.pack(">I4sI4s4s4s", size, b"\0" * 4, 0x02400000, b"mntr", b"RGB ", b"XYZ ")
+        + b"\0" * 12
+        + b"acsp"
+        + b"\0" * 28
+        + white
+        + b"\0" * 48
+    )
     return header + struct.pack(">I", len(tags)) + table + body
 
 
@@ -408,7 +432,9 @@ def test_exr_with_nan_or_infinity_says_where(tmp_path: Path, bad: float) -> None
 def test_exr_layers_of_a_blender_matcap_add(tmp_path: Path) -> None:
     import OpenEXR
 
-    half = {f"{layer}.{c}": np.full((16, 16), value, dtype=np.float32) for layer, value in (("diffuse", 0.25), ("specular", 0.5)) for c in "RGB"}
+    half = {
+        f"{layer}.{c}": np.full((16, 16), value, dtype=np.float32) for layer, value in (("diffuse", 0.25), ("specular", 0.5)) for c in "RGB"
+    }
     with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, half) as file:
         file.write(str(tmp_path / "layers.exr"))
     assert np.allclose(read_picture(tmp_path / "layers.exr").rgb, 0.75)
@@ -447,7 +473,10 @@ def bad_inputs(folder: Path) -> dict[str, tuple[bytes, str]]:
         "one.png": (one.getvalue(), "got 1 x 1"),
         "huge.png": (png(40000, 40000, (b"IDAT", b"")), "40,000 x 40,000"),
         "huge.hdr": (hdr(np.zeros(0, np.uint8), 40000, 40000), "40,000 x 40,000"),
-        "huge.bmp": (b"BM" + struct.pack("<IHHI", 54, 0, 0, 54) + struct.pack("<IiiHHIIiiII", 40, 40000, 40000, 1, 24, 0, 0, 0, 0, 0, 0), "larger than|40,000"),
+        "huge.bmp": (
+            b"BM" + struct.pack("<IHHI", 54, 0, 0, 54) + struct.pack("<IiiHHIIiiII", 40, 40000, 40000, 1, 24, 0, 0, 0, 0, 0, 0),
+            "larger than|40,000",
+        ),
         "animated.gif": (animated.getvalue(), "3 frames"),
         "clear.png": (clear.getvalue(), "fully transparent"),
         "cut.exr": (b"\x76\x2f\x31\x01\x02\0\0\0chan", "damaged|OpenEXR"),

@@ -62,7 +62,9 @@ def srgb_encode(linear: NDArray[np.floating]) -> Array:
 
 def srgb_decode(encoded: NDArray[np.floating]) -> NDArray[np.float64]:
     """sRGB to linear light."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.04045) + 0.055) / 1.055) ** 2.4)
+    encoded = encoded.astype(np.float64)
+    light: NDArray[np.float64] = np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.04045) + 0.055) / 1.055) ** 2.4)
+    return light
 
 
 def to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
@@ -198,7 +200,11 @@ def matrix_shaper(data: bytes) -> Primaries | None:
     Source: ICC.1:2022, 7.3 (tag table), 10.6 (curveType), 10.18 (parametricCurveType), 10.31 (XYZType).
     """
     tags = _icc_tags(data)
-    if data[16:20] != b"RGB " or b"A2B0" in tags or any(name not in tags for name in (b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC")):
+    if (
+        data[16:20] != b"RGB "
+        or b"A2B0" in tags
+        or any(name not in tags for name in (b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"))
+    ):
         return None
     curves = tuple(_curve(tags[name]) for name in (b"rTRC", b"gTRC", b"bTRC"))
     if any(curve is None for curve in curves) or any(len(tags[name]) < 20 for name in (b"rXYZ", b"gXYZ", b"bXYZ")):
@@ -232,7 +238,8 @@ def _curve(tag: bytes) -> NDArray[np.float64] | None:
         needed = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}.get(kind, 99)
         if len(tag) < 12 + 4 * needed:
             return None
-        g, a, b, c, d, e, f = [*(np.array(struct.unpack(f">{needed}i", tag[12 : 12 + 4 * needed])) / 65536.0), *[0.0] * (7 - needed)]
+        stored = [number / 65536.0 for number in struct.unpack(f">{needed}i", tag[12 : 12 + 4 * needed])]
+        g, a, b, c, d, e, f = stored + [0.0] * (7 - needed)
         if kind == 0:
             return steps**g
         powered = np.maximum(a * steps + b, 0.0) ** g

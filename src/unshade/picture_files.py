@@ -17,6 +17,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PILImage
+from PIL import UnidentifiedImageError
 
 from unshade import color_profiles, scene_linear
 from unshade.errors import PictureError
@@ -118,8 +119,10 @@ def _read_display(path: Path, start: bytes, colors: bool) -> Picture:
             with PILImage.open(path, formats=_FORMATS) as image:
                 check_size(path, *image.size)
                 return _decode(path, image, colors)
-    except PILImage.UnidentifiedImageError:
-        raise PictureError(f"{path}: expected a picture (PNG, JPEG, WebP, TIFF, EXR, HDR ...), got something else or a damaged header") from None
+    except UnidentifiedImageError:
+        raise PictureError(
+            f"{path}: expected a picture (PNG, JPEG, WebP, TIFF, EXR, HDR ...), got something else or a damaged header"
+        ) from None
     except (PILImage.DecompressionBombError, PILImage.DecompressionBombWarning):
         raise PictureError(f"{path}: larger than {MAX_PIXELS // 1_000_000} million pixels; scale it down first") from None
     except _BROKEN as error:
@@ -219,9 +222,9 @@ def _loaded(image: PILImage.Image, rawmode: str) -> PILImage.Image:
     source = image.filename  # type: ignore[attr-defined]
     with PILImage.open(source, formats=[image.format or ""]) as again:
         tiles = []
-        for codec, extents, offset, arguments in again.tile:  # type: ignore[attr-defined]
+        for codec, extents, offset, arguments in again.tile:
             changed = (rawmode, *arguments[1:]) if isinstance(arguments, tuple) else rawmode
             tiles.append((codec, extents, offset, changed))
-        again.tile = [type(old)(*new) for old, new in zip(again.tile, tiles, strict=True)]  # type: ignore[attr-defined]
+        again.tile = [type(old)(*new) for old, new in zip(again.tile, tiles, strict=True)]
         again.load()
         return again.copy()

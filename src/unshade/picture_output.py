@@ -70,7 +70,10 @@ def write_picture(path: str | Path, image: Image, alpha: Mask | None = None, *, 
     if bits not in (8, 16) or (bits == 16 and suffix not in (".png", ".exr")):
         raise OutputError(f"{path}: expected 8 bits, or 16 for PNG, got {bits} for {suffix}")
     if image.ndim != 3 or image.shape[0] not in (1, 3) or (alpha is not None and alpha.shape != (1, *image.shape[1:])):
-        raise OutputError(f"{path}: expected an image (3, H, W) and alpha (1, H, W), got {tuple(image.shape)} and {None if alpha is None else tuple(alpha.shape)}")
+        raise OutputError(
+            f"{path}: expected an image (3, H, W) and alpha (1, H, W), "
+            f"got {tuple(image.shape)} and {None if alpha is None else tuple(alpha.shape)}"
+        )
     color = np.moveaxis(image.detach().cpu().expand(3, -1, -1).double().numpy(), 0, -1)
     opacity = None if alpha is None else alpha[0].detach().cpu().double().clamp(0, 1).numpy()
     if not np.isfinite(color).all():
@@ -80,7 +83,9 @@ def write_picture(path: str | Path, image: Image, alpha: Mask | None = None, *, 
         _writer(suffix, color, opacity, bits, exposure)(temporary)
 
 
-def _writer(suffix: str, color: NDArray[np.float64], alpha: NDArray[np.float64] | None, bits: int, exposure: float) -> Callable[[Path], None]:
+def _writer(
+    suffix: str, color: NDArray[np.float64], alpha: NDArray[np.float64] | None, bits: int, exposure: float
+) -> Callable[[Path], None]:
     if suffix == ".exr":
         linear = (srgb_decode(color) / exposure).astype(np.float32)
         return lambda path: scene_linear.write_exr(path, linear, None if alpha is None else alpha.astype(np.float32))
@@ -90,7 +95,9 @@ def _writer(suffix: str, color: NDArray[np.float64], alpha: NDArray[np.float64] 
     if bits == 16:
         data = write_png(np.round(np.moveaxis(channels, -1, 0) * 65535).astype(np.uint16))
         return lambda path: _write_bytes(path, data)
-    options: dict[str, object] = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"lossless": True, "exact": True}}.get(_PILLOW[suffix], {})  # type: ignore[assignment]
+    options: dict[str, object] = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"lossless": True, "exact": True}}.get(
+        _PILLOW[suffix], {}
+    )  # type: ignore[assignment]
     picture = PILImage.fromarray(np.round(channels * 255).astype(np.uint8))
     return lambda path: picture.save(path, format=_PILLOW[suffix], **options)
 

@@ -73,7 +73,9 @@ def read_sphere(
     return _cut(str(path), picture, disc, ignored, size, exposure)
 
 
-def sphere_from_array(image: torch.Tensor | NDArray[np.floating], *, disc: Sequence[float] | Disc | None = None, size: int = SIZE) -> SphereImage:
+def sphere_from_array(
+    image: torch.Tensor | NDArray[np.floating], *, disc: Sequence[float] | Disc | None = None, size: int = SIZE
+) -> SphereImage:
     """The same for a picture in memory: (3, H, W) tensor or array, display-encoded in [0, 1]; (4, H, W) has alpha."""
     array = np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image)
     if array.ndim != 3 or array.shape[0] not in (3, 4) or not np.issubdtype(array.dtype, np.floating):
@@ -136,7 +138,9 @@ def _locate(name: str, rgb: NDArray[np.float32], alpha: NDArray[np.float32] | No
         return found
     found = find_disc(rgb.astype(np.float64))
     if found is None:
-        frame = "neither a circle on a plain background nor a smooth square MatCap" if width == height else "no circle on a plain background"
+        frame = (
+            "neither a circle on a plain background nor a smooth square MatCap" if width == height else "no circle on a plain background"
+        )
         raise PictureError(f"{name}: no sphere found in {width} x {height} pixels ({frame}); use --disc cx,cy,r")
     return found
 
@@ -149,7 +153,9 @@ def _given(name: str, disc: Sequence[float] | Disc, picture: Picture) -> Disc:
     if r < MIN_SIDE / 2:
         raise PictureError(f"{name}: expected a disc radius of at least {MIN_SIDE / 2:g} pixels, got {r:g}")
     if not (0 <= cx <= picture.width and 0 <= cy <= picture.height) or r > max(picture.width, picture.height):
-        raise PictureError(f"{name}: expected a disc inside {picture.width} x {picture.height} pixels, got centre {cx:g},{cy:g} and radius {r:g}")
+        raise PictureError(
+            f"{name}: expected a disc inside {picture.width} x {picture.height} pixels, got centre {cx:g},{cy:g} and radius {r:g}"
+        )
     return disc if isinstance(disc, Disc) else Disc(cx, cy, r)
 
 
@@ -236,10 +242,11 @@ def read_normals(path: str | Path) -> Normals:
     if picture.alpha is not None:
         away &= picture.alpha > 0.5
     if away.mean() > 0.02 or not 0.5 < float(np.median(length)) < 1.5:
-        raise PictureError(f"{path}: expected a normal map (blue facing the viewer, OpenGL green up), got colours that are not unit vectors")
+        raise PictureError(
+            f"{path}: expected a normal map (blue facing the viewer, OpenGL green up), got colours that are not unit vectors"
+        )
     empty = length[..., 0] < 0.1
     if picture.alpha is not None:
         empty |= picture.alpha < 0.5
     vectors = np.where(empty[..., None], (0.0, 0.0, 1.0), vectors / np.maximum(length, 1e-6))
     return torch.from_numpy(np.ascontiguousarray(np.moveaxis(vectors, -1, 0)).astype(np.float32))
-

@@ -52,7 +52,8 @@ def _checked(path: Path, rgb: Array) -> Array:
     if bad.any():
         row, column = (int(k) for k in np.argwhere(bad)[0])
         raise PictureError(
-            f"{path}: expected finite numbers, got NaN or infinity in {int(bad.sum())} pixels, the first at x {column}, y {row}; replace them first"
+            f"{path}: expected finite numbers, got NaN or infinity in {int(bad.sum())} pixels, "
+            f"the first at x {column}, y {row}; replace them first"
         )
     return np.maximum(rgb, np.float32(0))
 
@@ -199,7 +200,9 @@ def _radiance_pixels(path: Path, body: bytes, width: int, height: int) -> NDArra
                 pixels[row] = np.frombuffer(body[at:end], dtype=np.uint8).reshape(width, 4)
             at = end
             if row == 0 and (pixels[0, 1:, :3] == 1).all(axis=-1).any():
-                raise PictureError(f"{path}: expected Radiance pixels flat or in the run lengths of 1991, got the older ones; save it again or as EXR")
+                raise PictureError(
+                    f"{path}: expected Radiance pixels flat or in the run lengths of 1991, got the older ones; save it again or as EXR"
+                )
         if at < 0 or at > len(body):
             raise PictureError(f"{path}: truncated or damaged Radiance picture, rows end at {row} of {height}")
     return pixels

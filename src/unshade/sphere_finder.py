@@ -161,12 +161,12 @@ def find_circle(rgb: Array) -> Disc | None:
 def _measured(rgb: Array, circle: tuple[float, float, float], pixel: float) -> Disc | None:
     """The circle at full resolution, None where too little of it shows as an edge."""
     reach = max(3.0, 2.5 * pixel, 0.05 * circle[2])
-    refined: tuple[float, ...] | None = None
+    refined: tuple[float, float, float, float, float] | None = None
     for step in range(4):
         refined = _refine(rgb, circle, reach)
         if refined is None:
             return None
-        circle = refined[:3]  # type: ignore[assignment]
+        circle = refined[:3]
         reach = max(2.5, 1.5 * pixel if step == 0 else 0.0, 0.02 * circle[2])
     assert refined is not None
     cx, cy, r, coverage, spread = refined
@@ -234,12 +234,14 @@ def _powers(x: Array, y: Array, degree: int) -> Array:
     return np.stack([x**i * y ** (total - i) for total in range(degree + 1) for i in range(total + 1)], axis=-1)
 
 
-
 def _resized(rgb: Array, width: int, height: int) -> Array:
     """Area-averaged copy."""
     if (rgb.shape[1], rgb.shape[0]) == (width, height):
         return rgb.astype(np.float64)
-    planes = [np.asarray(PILImage.fromarray(rgb[..., c].astype(np.float32)).resize((width, height), PILImage.Resampling.BOX)) for c in range(rgb.shape[2])]
+    planes = [
+        np.asarray(PILImage.fromarray(rgb[..., c].astype(np.float32)).resize((width, height), PILImage.Resampling.BOX))
+        for c in range(rgb.shape[2])
+    ]
     return np.stack(planes, axis=-1).astype(np.float64)
 
 

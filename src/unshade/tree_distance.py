@@ -160,7 +160,7 @@ def _apart(parameter: Parameter, a: Value, b: Value) -> float:
         return 0.0
     if isinstance(a, Raster) or isinstance(b, Raster):
         same_size = isinstance(a, Raster) and isinstance(b, Raster) and (a.height, a.width) == (b.height, b.width)
-        return float(np.abs(_picture(a) - _picture(b)).mean()) if same_size else 1.0  # type: ignore[arg-type]
+        return float(np.abs(_picture(a) - _picture(b)).mean()) if same_size else 1.0
     if parameter.type == "direction":
         # Half the chord's length is exact for near directions, where the arc cosine is not.
         return 2.0 / math.pi * math.asin(min(1.0, 0.5 * math.dist(a, b)))

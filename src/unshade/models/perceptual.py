@@ -78,8 +78,12 @@ def _weights(net: Net, device: torch.device, dtype: torch.dtype) -> dict[str, Te
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise MissingExtraError(f"{path}: the weight file is damaged ({type(error).__name__}); install stlpips-pytorch 0.0.2 again") from None
-    wanted = [f"{layer.key}.{part}" for stage in _LAYERS[net] for layer in stage if isinstance(layer, _Convolution) for part in ("weight", "bias")]
+        raise MissingExtraError(
+            f"{path}: the weight file is damaged ({type(error).__name__}); install stlpips-pytorch 0.0.2 again"
+        ) from None
+    wanted = [
+        f"{layer.key}.{part}" for stage in _LAYERS[net] for layer in stage if isinstance(layer, _Convolution) for part in ("weight", "bias")
+    ]
     wanted += ["scaling_layer.shift", "scaling_layer.scale", *(f"lin{k}.model.1.weight" for k in range(5))]
     missing = [key for key in wanted if key not in state]
     if missing:
