@@ -56,7 +56,15 @@ def _render(leaves: list[Leaf], normals: torch.Tensor) -> Atoms:
 def lights() -> list[Leaf]:
     """Highlights from broad to as small as a few pixels, and rims."""
     found = []
-    for sharpness, count, lowest in ((0.3, 24, -0.6), (0.8, 40, -0.5), (2.0, 70, -0.4), (5.0, 110, -0.3), (12.0, 170, -0.2), (35.0, 260, -0.1), (110.0, 420, 0.0)):
+    for sharpness, count, lowest in (
+        (0.3, 24, -0.6),
+        (0.8, 40, -0.5),
+        (2.0, 70, -0.4),
+        (5.0, 110, -0.3),
+        (12.0, 170, -0.2),
+        (35.0, 260, -0.1),
+        (110.0, 420, 0.0),
+    ):
         found += [leaf("highlight", direction=d, sharpness=sharpness) for d in directions(count, lowest).tolist()]
     for exponent in (0.7, 1.5, 3.0, 7.0):
         for k in range(16):
@@ -134,7 +142,16 @@ def plain_shades() -> list[Leaf]:
     return found
 
 
-FAMILIES = {"plain_lights": plain_lights, "plain_masks": plain_masks, "plain_shades": plain_shades, "lights": lights, "spots": spots, "environments": environments, "masks": masks, "shades": shades}
+FAMILIES = {
+    "plain_lights": plain_lights,
+    "plain_masks": plain_masks,
+    "plain_shades": plain_shades,
+    "lights": lights,
+    "spots": spots,
+    "environments": environments,
+    "masks": masks,
+    "shades": shades,
+}
 
 
 @lru_cache(maxsize=len(FAMILIES))

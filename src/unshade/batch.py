@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from unshade import __version__, crew
 from unshade.errors import OutputError, PictureError, UnshadeError
@@ -43,7 +43,7 @@ class Settings:
     max_values: int | None = None
     seed: int = 0
     alternatives: int = 1
-    search: str = "size"
+    search: Literal["size", "depth"] = "size"
     disc: tuple[float, float, float] | None = None
     mask: str | None = None
     artifacts: str = "all"

@@ -62,8 +62,8 @@ def srgb_encode(linear: NDArray[np.floating]) -> Array:
 
 def srgb_decode(encoded: NDArray[np.floating]) -> NDArray[np.float64]:
     """sRGB to linear light."""
-    encoded = encoded.astype(np.float64)
-    light: NDArray[np.float64] = np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.04045) + 0.055) / 1.055) ** 2.4)
+    stored = encoded.astype(np.float64)
+    light: NDArray[np.float64] = np.where(stored <= 0.04045, stored / 12.92, ((np.maximum(stored, 0.04045) + 0.055) / 1.055) ** 2.4)
     return light
 
 
@@ -77,13 +77,13 @@ def to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
 def adapt(source_white: NDArray[np.float64], target_white: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3) Bradford adaptation of XYZ from one white to another."""
     gains = (_BRADFORD @ target_white) / (_BRADFORD @ source_white)
-    return np.linalg.solve(_BRADFORD, gains[:, None] * _BRADFORD)
+    return np.asarray(np.linalg.solve(_BRADFORD, gains[:, None] * _BRADFORD), dtype=np.float64)
 
 
 def matrix_to_srgb(chromaticities: Chromaticities) -> NDArray[np.float64]:
     """(3, 3) from linear RGB of these primaries to linear sRGB; white stays white."""
     source, target = to_xyz(chromaticities), to_xyz(SRGB)
-    return np.linalg.solve(target, adapt(source.sum(1), target.sum(1)) @ source)
+    return np.asarray(np.linalg.solve(target, adapt(source.sum(1), target.sum(1)) @ source), dtype=np.float64)
 
 
 def declared(path: Path, image: PILImage.Image) -> Profile:

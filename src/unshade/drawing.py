@@ -208,7 +208,7 @@ def _symbols(tree: Tree, places: dict[str, str], prefix: str, size: int, encodin
     for address, picture in pictures:
         node = nodes[address]
         if isinstance(node, Leaf) and node.kind == "albedo":
-            shape = f'<circle cx=".5" cy=".5" r=".5" fill="{shown_color(node["color"], tree.blend_space)}"/>'  # type: ignore[arg-type]
+            shape = f'<circle cx=".5" cy=".5" r=".5" fill="{shown_color(node["color"], tree.blend_space)}"/>'
         elif picture is None:
             shape = '<circle cx=".5" cy=".5" r=".5" fill="#8a8a8a"/>'
         else:
@@ -302,7 +302,7 @@ def _leaf_words(box: _Box, tree: Tree, places: dict[str, str], base: float) -> s
         )
         parts.append(_text("sign", box.x, base + 21, "×"))
         base += SMALL + 6
-        lines = [shown_color(pair[0]["color"], tree.blend_space)]  # type: ignore[arg-type]
+        lines = [shown_color(pair[0]["color"], tree.blend_space)]
     parts.append(_text("name", box.x, base + LINE + 2, label(box.node)))
     if isinstance(shown, Leaf):
         lines = (key_values(shown, tree.blend_space, 2) if box.pair else key_values(shown, tree.blend_space)) + lines

@@ -210,12 +210,23 @@ for _kind in (
         "a reflected environment as a picture",
         channels=3,
     ),
-    Kind("image", Role.PAINT, shading.image, (Parameter("pixels", "raster", "picture of the sphere"),), "a picture indexed by n.xy", channels=3),
+    Kind(
+        "image",
+        Role.PAINT,
+        shading.image,
+        (Parameter("pixels", "raster", "picture of the sphere"),),
+        "a picture indexed by n.xy",
+        channels=3,
+    ),
     Kind(
         "threshold",
         Role.MASK,
         shading.threshold,
-        (_direction("towards the side where the mask is 1"), _scalar("threshold", -2.5, 2.5, 0.0, "n.l at the middle of the edge"), _softness(0.0)),
+        (
+            _direction("towards the side where the mask is 1"),
+            _scalar("threshold", -2.5, 2.5, 0.0, "n.l at the middle of the edge"),
+            _softness(0.0),
+        ),
         "mask: one side of a circle",
     ),
     Kind(
@@ -230,7 +241,9 @@ for _kind in (
         ),
         "mask: a band",
     ),
-    Kind("image_mask", Role.MASK, shading.image_mask, (Parameter("pixels", "raster", "picture of the mask", channels=1),), "mask: a picture"),
+    Kind(
+        "image_mask", Role.MASK, shading.image_mask, (Parameter("pixels", "raster", "picture of the mask", channels=1),), "mask: a picture"
+    ),
 ):
     register(_kind)
 
@@ -254,7 +267,8 @@ class Raster:
         array = np.asarray(array.detach().cpu() if isinstance(array, torch.Tensor) else array, dtype=np.float64)
         if array.ndim != 3 or not np.isfinite(array).all() or array.min() < 0.0 or array.max() > 1.0:
             raise TreeError("raster: needs (channels, height, width) finite numbers in [0, 1]")
-        return cls(*array.shape, data=np.round(array * 65535.0).astype(">u2").tobytes())
+        channels, height, width = array.shape
+        return cls(channels, height, width, np.round(array * 65535.0).astype(">u2").tobytes())
 
     def array(self) -> np.ndarray:
         """(C, H, W) float64 in [0, 1]."""
@@ -314,19 +328,24 @@ class Leaf:
             raise TreeError(f"{kind.name}: expected {len(kind.parameters)} parameters, got {len(self.values)}")
         cleaned = tuple(_clean(kind, parameter, value) for parameter, value in zip(kind.parameters, self.values, strict=True))
         if kind.repeats:
-            lobes = {len(value) // parameter.size for parameter, value in zip(kind.parameters, cleaned, strict=True) if not isinstance(value, Raster)}
+            lobes = {
+                len(value) // parameter.size
+                for parameter, value in zip(kind.parameters, cleaned, strict=True)
+                if not isinstance(value, Raster)
+            }
             if len(lobes) != 1:
                 raise TreeError(f"{kind.name}: every parameter needs as many entries as there are lobes, got {sorted(lobes)}")
         object.__setattr__(self, "values", cleaned)
 
-    def __getitem__(self, parameter: str) -> Value:
+    def __getitem__(self, parameter: str) -> Any:
+        """The value of a parameter: a tuple of numbers, or a Raster. Raises AddressError."""
         kind = KINDS[self.kind]
         return self.values[kind.parameters.index(kind.parameter(parameter))]
 
     def set(self, **values: object) -> Leaf:
         """A copy with some parameters changed."""
         kind = KINDS[self.kind]
-        index = {kind.parameters.index(kind.parameter(name)): value for name, value in values.items()}
+        index: dict[int, Any] = {kind.parameters.index(kind.parameter(name)): value for name, value in values.items()}
         return dataclasses.replace(self, values=tuple(index.get(k, value) for k, value in enumerate(self.values)))
 
     @property
@@ -339,7 +358,7 @@ class Leaf:
     def role(self) -> Role:
         """The kind's role, but a highlight broader than `BROAD_SHARPNESS` is diffuse."""
         role = KINDS[self.kind].role
-        if self.kind == "highlight" and self["sharpness"][0] < BROAD_SHARPNESS:  # type: ignore[operator]
+        if self.kind == "highlight" and self["sharpness"][0] < BROAD_SHARPNESS:
             return Role.DIFFUSE
         return role
 
@@ -516,10 +535,11 @@ def walk(root: Node) -> Iterator[tuple[str, Node]]:
 
 def find_address(root: Node, where: str) -> str:
     """The full address for an address, an address without its last kind, a name, or the kind of a single node."""
-    known = {address: node for address, node in walk(root)}
+    known = dict(walk(root))
     if where in known:
         return where
-    matches = [address for address, node in known.items() if node.name == where or address.rpartition(".")[0] == where and address.rpartition(".")[0][-1:].isdigit()]
+    without_kind = where if where[-1:].isdigit() else None
+    matches = [address for address, node in known.items() if node.name == where or address.rpartition(".")[0] == without_kind]
     matches = matches or [address for address, node in known.items() if node.kind == where]
     if len(matches) == 1:
         return matches[0]

@@ -34,7 +34,7 @@ def _card(tree: Tree, place: str, address: str, node: Node, leaf: Leaf, tint: Le
         place: id of the symbol with the node's picture in the drawn tree.
         node: the leaf, or the multiply of a tinted light.
     """
-    rows = [_row("tint", _swatch(labels.shown_color(tint["color"], tree.blend_space)))] if tint else []  # type: ignore[arg-type]
+    rows = [_row("tint", _swatch(labels.shown_color(tint["color"], tree.blend_space)))] if tint else []
     carried = KINDS[leaf.kind].amplitude if carried_amplitude(node) else None
     shown = [(parameter, value) for parameter, value in labels.stored(leaf) if parameter.name != carried]
     rows += (

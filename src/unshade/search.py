@@ -104,7 +104,13 @@ class Samples:
 class Search:
     """One search. `run` yields better and better candidates; `front` holds the curve."""
 
-    def __init__(self, samples: Samples, effort: Effort, families: tuple[str, ...] = ("lights", "masks", "shades", "spots", "environments"), skip: int = 0) -> None:
+    def __init__(
+        self,
+        samples: Samples,
+        effort: Effort,
+        families: tuple[str, ...] = ("lights", "masks", "shades", "spots", "environments"),
+        skip: int = 0,
+    ) -> None:
         self.samples, self.effort, self.families, self.skip = samples, effort, families, skip
         self.front = Front()
         """Trees that were fitted to points of the full picture."""
@@ -171,7 +177,13 @@ class Search:
             return sharp
         for _ in range(2):
             before = sharp
-            for sharp in self._grow(self._fit(sharp.root, self.samples.points, effort.growth_steps), self.samples.points, self.samples.points_dictionary, FLOOR, PLAIN):
+            for sharp in self._grow(
+                self._fit(sharp.root, self.samples.points, effort.growth_steps),
+                self.samples.points,
+                self.samples.points_dictionary,
+                FLOOR,
+                PLAIN,
+            ):
                 yield "plain", sharp
             sharp = self._sharpen(self._sweep(self._sharpen(sharp), self.samples.fine))
             yield "plain", sharp
@@ -221,7 +233,9 @@ class Search:
         return leaf("albedo", color=mean.tolist())
 
     def _fit(self, root: Node, pixels: Pixels, steps: int, tolerance: float = 1e-3) -> Candidate:
-        fitted: Fitted = fit_pixels(pixels, root, steps=steps, tolerance=tolerance, softest=FINE_SOFTNESS if pixels is not self.samples.coarse else COARSE_SOFTNESS)
+        fitted: Fitted = fit_pixels(
+            pixels, root, steps=steps, tolerance=tolerance, softest=FINE_SOFTNESS if pixels is not self.samples.coarse else COARSE_SOFTNESS
+        )
         candidate = Candidate(fitted.root, fitted.error)
         (self.rough if pixels is self.samples.coarse else self.front).add(candidate)
         return candidate
@@ -289,9 +303,8 @@ class Search:
         if not options:
             return current
         smaller = self._fit(options[min(number, len(options) - 1)][1], pixels, self.effort.growth_steps)
-        for smaller in self._grow(smaller, pixels, self.samples.points_dictionary, FLOOR):
-            pass
-        return smaller
+        *_, regrown = [smaller, *self._grow(smaller, pixels, self.samples.points_dictionary, FLOOR)]
+        return regrown
 
     def _polish(self, current: Candidate) -> Candidate:
         return self._sharpen(current)
@@ -320,6 +333,6 @@ def outline(root: Node) -> str:
 def harden(root: Node, softest: float) -> Node:
     """The tree with every edge of about a pixel made hard."""
     for address, node in walk(root):
-        if isinstance(node, Leaf) and node.kind in ("threshold", "stripe", "toon_highlight") and node["softness"][0] <= softest:  # type: ignore[operator]
+        if isinstance(node, Leaf) and node.kind in ("threshold", "stripe", "toon_highlight") and node["softness"][0] <= softest:
             root = replace(root, address, node.set(softness=0.0))
     return root

@@ -21,15 +21,18 @@ Derivatives = tuple[torch.Tensor, ...]
 
 
 def diffuse(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, ambient: Params) -> Derivatives:
+    """By n.l and ambient."""
     return (1.0 - ambient) * (facing > 0.0), 1.0 - facing.clamp(min=0.0)
 
 
 def highlight(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, sharpness: Params, amplitude: Params) -> Derivatives:
+    """By n.l, sharpness and amplitude; 0 on a plateau."""
     open_value = value * (value < 1.0)
     return 2.0 * sharpness * open_value, 2.0 * (facing - 1.0) * open_value, open_value / amplitude.clamp(min=1e-6)
 
 
 def rim(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, exponent: Params) -> Derivatives:
+    """By n.l and exponent."""
     return grazing**exponent * (facing > 0.0), value * grazing.log()
 
 
@@ -40,13 +43,19 @@ def _edge(facing: torch.Tensor, low: Params, width: Params) -> tuple[torch.Tenso
     return t * t * (3.0 - 2.0 * t), 6.0 * t * (1.0 - t) / width, t
 
 
-def toon_diffuse(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, ambient: Params, threshold: Params, softness: Params) -> Derivatives:
+def toon_diffuse(
+    value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, ambient: Params, threshold: Params, softness: Params
+) -> Derivatives:
+    """By n.l, ambient, threshold and softness."""
     step, slope, t = _edge(facing, threshold, softness)
     slope = (1.0 - ambient) * slope
     return slope, 1.0 - step, -slope, -slope * t
 
 
-def toon_highlight(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, radius: Params, brightness: Params, softness: Params) -> Derivatives:
+def toon_highlight(
+    value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, radius: Params, brightness: Params, softness: Params
+) -> Derivatives:
+    """By n.l, radius, brightness and softness; the edge is in angles."""
     cosine = facing.clamp(-1.0 + 1e-7, 1.0 - 1e-7)
     step, slope, t = _edge(cosine.acos(), radius - 0.5 * softness, softness)
     slope = brightness * slope
@@ -54,11 +63,15 @@ def toon_highlight(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Ten
 
 
 def threshold(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, threshold: Params, softness: Params) -> Derivatives:
+    """By n.l, threshold and softness."""
     _, slope, t = _edge(facing, threshold - 0.5 * softness, softness)
     return slope, -slope, slope * (0.5 - t)
 
 
-def stripe(value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, center: Params, width: Params, softness: Params) -> Derivatives:
+def stripe(
+    value: torch.Tensor, facing: torch.Tensor, grazing: torch.Tensor, center: Params, width: Params, softness: Params
+) -> Derivatives:
+    """By n.l, center, width and softness."""
     offset = facing - center
     _, slope, t = _edge(offset.abs(), 0.5 * (width - softness), softness)
     outward = slope * offset.sign()
