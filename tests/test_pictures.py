@@ -159,6 +159,12 @@ def test_what_lies_outside_the_frame_does_not_count(tmp_path: Path) -> None:
     assert not left.any() and sphere.valid[0, 128, 60]
 
 
+def test_the_silhouette_in_front_of_a_background_does_not_count(tmp_path: Path) -> None:
+    sphere = read_sphere(save(tmp_path / "scene.png", scene(150, 120, (70, 60, 40), 0, "plain", 0)))
+    radius = np.sqrt(float(sphere.valid.float().mean()) * 4 / np.pi)
+    assert 0.975 < radius < 0.99
+
+
 # --- Resampling
 
 
@@ -438,6 +444,31 @@ def test_exr_layers_of_a_blender_matcap_add(tmp_path: Path) -> None:
     with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, half) as file:
         file.write(str(tmp_path / "layers.exr"))
     assert np.allclose(read_picture(tmp_path / "layers.exr").rgb, 0.75)
+
+
+@needs_exr
+def test_exr_chromaticities_are_converted(tmp_path: Path) -> None:
+    import OpenEXR
+
+    path = tmp_path / "wide.exr"
+    pixels = np.full((16, 16, 3), 0.5, dtype=np.float32)
+    pixels[:, 8:] = (0.4, 0.5, 0.5)
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {"RGB": pixels}) as file:
+        file.write(str(path))
+    # The library does not write this attribute: put it first, and move the one entry of the table of offsets.
+    data = path.read_bytes()
+    red_first = (*color_profiles.REC2020[2:], *color_profiles.REC2020[:2])
+    attribute = b"chromaticities\0chromaticities\0" + struct.pack("<i8f", 32, *red_first)
+    end = 8
+    while data[end]:
+        end = data.index(b"\0", data.index(b"\0", end) + 1) + 1
+        end += 4 + struct.unpack("<i", data[end : end + 4])[0]
+    offset = struct.unpack("<Q", data[end + 1 : end + 9])[0] + len(attribute)
+    path.write_bytes(data[:8] + attribute + data[8 : end + 1] + struct.pack("<Q", offset) + data[end + 9 :])
+    expected = color_profiles.matrix_to_srgb(color_profiles.REC2020) @ (0.4, 0.5, 0.5)
+    found = read_picture(path).rgb
+    assert np.allclose(found[0, 0], 0.5, atol=1e-4) and np.allclose(found[0, -1], expected, atol=1e-4)
+    assert np.abs(expected - (0.4, 0.5, 0.5)).max() > 0.03
 
 
 def test_exr_without_its_reader_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -199,8 +199,10 @@ def _resample(
         exact = cover == 1.0
         color[:, exact] = np.stack([red, green, blue])[:, exact]
     image = torch.from_numpy(np.clip(color, 0.0, 1.0).astype(np.float32))
-    grid = sphere_grid(size)
-    valid = (grid.square().sum(0) <= 1.0) & torch.from_numpy((cover > 0.5) & (counted > 0.5))
+    # In front of a background the silhouette's own pixels show some of it; a MatCap that fills its frame goes on past them.
+    fills_frame = abs(disc.r - min(width, height) / 2) < 0.5
+    reach = 1.0 if alpha is not None or fills_frame else 1.0 - 0.75 / disc.r
+    valid = (sphere_grid(size).square().sum(0) <= reach * reach) & torch.from_numpy((cover > 0.5) & (counted > 0.5))
     return SphereImage(image, valid[None], disc, exposure)
 
 
