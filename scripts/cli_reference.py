@@ -27,7 +27,8 @@ def reference() -> str:
 
 def help_text(path: str, command: click.Command) -> str:
     """What ``path --help`` prints at a fixed width."""
-    context = click.Context(command, info_name=path, terminal_width=WIDTH, max_content_width=WIDTH)
+    settings = {**cli.context_settings, **command.context_settings, "terminal_width": WIDTH, "max_content_width": WIDTH}
+    context = click.Context(command, info_name=path, **settings)
     return "\n".join(line.rstrip() for line in command.get_help(context).splitlines()).strip()
 
 

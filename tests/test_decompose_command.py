@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 from PIL import Image as PILImage
 
 from unshade import cli
+from unshade.decompose import PRESETS
 from unshade.serde import load, load_family
+
+
+@pytest.fixture(autouse=True)
+def _as_the_program_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTORCH_JIT", "0")
 
 
 def program(*arguments: object) -> subprocess.Popen[str]:
@@ -29,6 +37,15 @@ def trees(folder: Path) -> dict[str, bytes]:
 
 def records(text: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in text.splitlines()]
+
+
+def test_the_presets_are_those_of_the_package() -> None:
+    option = next(option for option in cli.cli.commands["decompose"].params if option.name == "preset")
+    assert isinstance(option.type, click.Choice)
+    assert list(option.type.choices) == list(PRESETS)
+    limits = [str(preset.max_values) for preset in PRESETS.values()]
+    assert isinstance(option, click.Option)
+    assert f"Up to {limits[0]}, {limits[1]} or {limits[2]} values" in str(option.help)
 
 
 @pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (12, 130, 250)])
@@ -74,7 +91,10 @@ def test_the_tree_does_not_depend_on_the_workers_or_the_batch(examples: Path, tm
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
 def test_ctrl_c_keeps_what_is_done_and_a_later_call_goes_on(examples: Path, tmp_path: Path) -> None:
-    arguments = ("decompose", examples, "-o", tmp_path / "out", "--workers", 2, "--preset", "draft", "--artifacts", "tree", "--json")
+    pictures = [tmp_path / f"{copy}_{path.name}" for path in sorted(examples.glob("*.png")) for copy in range(2)]
+    for picture in pictures:
+        shutil.copy(examples / picture.name[2:], picture)
+    arguments = ("decompose", *pictures, "-o", tmp_path / "out", "--workers", 2, "--preset", "draft", "--artifacts", "tree", "--json")
     with program(*arguments) as process:
         assert process.stdout is not None
         assert process.stderr is not None
@@ -89,6 +109,6 @@ def test_ctrl_c_keeps_what_is_done_and_a_later_call_goes_on(examples: Path, tmp_
     with program(*arguments) as process:
         out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
-    assert [record["input"] for record in records(out)] == [str(path) for path in sorted(examples.glob("*.png"))]
+    assert [record["input"] for record in records(out)] == [str(path) for path in pictures]
     assert records(out)[0] == first
     assert Path(first["tree"]).stat().st_mtime_ns == kept

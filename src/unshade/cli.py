@@ -439,5 +439,10 @@ def main() -> None:
             stream.reconfigure(errors="replace")
     # Before numpy and torch load: one thread, so that no result depends on the cores.
     os.environ.update(OMP_NUM_THREADS="1", MKL_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    # PyTorch compiles a table of derivatives that is not used here, for 0.2 s, when forward-mode differentiation begins.
+    os.environ["PYTORCH_JIT"] = "0"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    sys.exit(run())
+    code = run()
+    # A late Ctrl-C would only put a traceback below what was said already.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.exit(code)
