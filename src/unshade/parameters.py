@@ -52,8 +52,8 @@ class Layout:
     def unpack(self, root: Node, vector: Params) -> Node:
         """The tree with the numbers of a (P,) vector, brought into range."""
         vector = vector.detach().to("cpu", torch.float64)
-        scale = torch.tensor([kind == "direction" for kind in self.types])
-        vector = torch.where(scale, vector, vector.clamp(self.lower, self.upper))
+        is_direction = torch.tensor([kind == "direction" for kind in self.types], dtype=torch.bool)
+        vector = torch.where(is_direction, vector, vector.clamp(self.lower, self.upper))
         numbers = vector.tolist()
         found = iter(self.slots)
 
