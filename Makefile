@@ -10,12 +10,13 @@ EXAMPLE ?= examples/red_lacquer.png
 PRESET  ?= balanced
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint pytest fast bench docs clean
+.PHONY: help demo test lint format pytest fast bench docs clean
 
 help:
 	@echo "make demo    set up, then decompose a real picture in front of you (EXAMPLE=..., PRESET=...)"
 	@echo "make test    set up, then every check: lint, types, import contracts, tests"
 	@echo "make lint    ruff, mypy and the import contracts only"
+	@echo "make format  lay out the code and sort its imports"
 	@echo "make fast    the tests without the slow ones"
 	@echo "make bench   data sets x methods; writes benchmarks/ (absent data sets are skipped by name)"
 	@echo "make docs    regenerate the gallery, the CLI reference and the pictures of the README"
@@ -42,8 +43,13 @@ test: lint pytest
 
 lint: $(VENV)/.dev
 	@$(BIN)/ruff check --quiet src tests scripts
+	@$(BIN)/ruff format --check --quiet src tests scripts || { echo "run: make format"; exit 1; }
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
+
+format: $(VENV)/.dev
+	@$(BIN)/ruff check --quiet --fix --select I src tests scripts
+	@$(BIN)/ruff format --quiet src tests scripts
 
 pytest: $(VENV)/.dev
 	@$(PY) -m pytest -n 2 --dist worksteal
