@@ -17,7 +17,7 @@ import unshade
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("examples/*.md"), *ROOT.glob("benchmarks/*.md")])
-LONGEST = {"src": 400, "scripts": 400, "tests": 600}
+LONGEST = {"src": 400, "scripts": 400, "tests": 650}
 """Lines; the tests of one module stay together."""
 LONGER_FILES = {
     "src/unshade/cli.py": ("every verb with its help", 480),

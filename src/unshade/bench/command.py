@@ -16,7 +16,7 @@ class BenchError(UnshadeError):
     """Some pictures could not be measured."""
 
 
-@click.command("bench")
+@click.command("bench", context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
     "--dataset",
     "datasets",
