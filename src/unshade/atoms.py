@@ -144,6 +144,7 @@ def plain_shades() -> list[Leaf]:
 
 FAMILIES = {
     "plain_lights": plain_lights,
+    "plain_spots": spots,
     "plain_masks": plain_masks,
     "plain_shades": plain_shades,
     "lights": lights,

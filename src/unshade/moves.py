@@ -53,11 +53,18 @@ def add_light(node: Node, light: Node) -> Node:
 
 def add_shade(node: Node, shade: Node) -> Node:
     """``multiply(node, shade)``, flat, but a tint stays a pair."""
-    if isinstance(node, Operator) and node.kind == "multiply" and tint(node) is None:
-        return dataclasses.replace(node, children=(*node.children, shade))
-    if isinstance(node, Operator) and node.kind == "multiply" and KINDS[tint(node)[1].kind].role is Role.DIFFUSE:  # type: ignore[index]
+    pair = tint(node)
+    if isinstance(node, Operator) and node.kind == "multiply" and (pair is None or KINDS[pair[1].kind].role is Role.DIFFUSE):
         return dataclasses.replace(node, children=(*node.children, shade))
     return multiply(node, shade)
+
+
+def recolored(base: Node, scale: list[float]) -> Node:
+    """The base with its paints scaled a channel, inside their range."""
+    for address, node in walk(base):
+        if isinstance(node, Leaf) and node.kind == "albedo":
+            base = replace(base, address, node.set(color=[min(max(c * s, 0.0), 1.0) for c, s in zip(node["color"], scale, strict=True)]))  # type: ignore[arg-type]
+    return base
 
 
 def is_paint(node: Node) -> bool:
@@ -98,7 +105,11 @@ class Anatomy:
         if isinstance(node, Operator) and node.kind == "multiply":
             factors = [(f"{address}.{k}.{child.kind}", child) for k, child in enumerate(node.children)]
         paints = tuple(
-            f"{where}{below[len(part.kind) :]}" for where, part in factors if is_paint(part) for below, leaf in walk(part) if leaf.kind == "albedo"
+            f"{where}{below[len(part.kind) :]}"
+            for where, part in factors
+            if is_paint(part)
+            for below, leaf in walk(part)
+            if leaf.kind == "albedo"
         )
         forms = tuple(where for where, part in factors if not is_paint(part)) if len(factors) > 1 else ()
         return Anatomy(canvas, base, paints, forms)
@@ -108,7 +119,7 @@ def complement(mask: Leaf) -> Leaf | None:
     """The threshold mask that is 1 where this one is 0."""
     if mask.kind != "threshold":
         return None
-    return mask.set(direction=[-x for x in mask["direction"]], threshold=-mask["threshold"][0])  # type: ignore[union-attr, operator, index]
+    return mask.set(direction=[-x for x in mask["direction"]], threshold=-mask["threshold"][0])
 
 
 class Proposer:
@@ -132,8 +143,8 @@ class Proposer:
         parts = Anatomy.of(root)
         found: list[Move] = []
         for family in families:
-            if family in ("lights", "plain_lights", "spots", "environments"):
-                found += self._lights(root, known[parts.canvas], residual, family, grey_only=False)
+            if family.endswith(("lights", "spots", "environments")):
+                found += self._lights(root, known[parts.canvas], residual, family, grey_only=family.startswith("plain"))
                 if family in ("lights", "spots"):
                     for where in parts.forms[:1]:
                         found += self._lights(root, known[where], residual, family, grey_only=True)
@@ -183,10 +194,13 @@ class Proposer:
         atoms = self.dictionary[family]
         # the picture changes by A m (c - X): least squares in c of (residual + A m X) - A m c
         gain, value = place.gain, place.value
-        squares_gain = (self.weight * gain.square()) @ atoms.squares.T
-        cross = (self.weight * gain * residual) @ atoms.pictures.T + (self.weight * gain.square() * value) @ atoms.squares.T
+        straight = torch.cat([self.weight * gain * residual, self.weight * gain * residual * value]) @ atoms.pictures.T
+        square = self.weight * gain.square()
+        squared = torch.cat([square, square * value, square * value.square()]) @ atoms.squares.T
+        squares_gain = squared[:3]
+        cross = straight[:3] + squared[3:6]
         color = (cross / squares_gain.clamp(min=1e-12)).clamp(0.0, 1.0)
-        constant = 2.0 * ((self.weight * gain * residual * value) @ atoms.pictures.T) + (self.weight * (gain * value).square()) @ atoms.squares.T
+        constant = 2.0 * straight[3:] + squared[6:]
         saved = (2.0 * color * cross - color.square() * squares_gain - constant).sum(0) / 3.0
         moves = []
         for k in self._best(atoms, saved, 3):
@@ -195,25 +209,35 @@ class Proposer:
         return moves
 
     def _shades(self, root: Node, place: _Place, residual: torch.Tensor, family: str) -> list[Move]:
+        """Shade the base and let its colours change with it: least squares in the lit and the unlit brightness."""
         atoms = self.dictionary[family]
-        basis = place.gain * place.value
-        # picture changes by basis (d - 1) t with t = 1 - ambient
-        first = self.weight * basis * residual
-        second = self.weight * basis.square()
-        up = (first.sum(0) @ atoms.pictures.T) - first.sum()
-        down = second.sum(0) @ atoms.squares.T - 2.0 * (second.sum(0) @ atoms.pictures.T) + second.sum()
-        strength = (up / down.clamp(min=1e-12)).clamp(0.0, 1.0)
-        saved = (2.0 * strength * up - strength.square() * down) / 3.0
+        base = place.gain * place.value
+        wanted = residual + base
+        straight = (self.weight * base * wanted) @ atoms.pictures.T
+        flat = (self.weight * base * wanted).sum(1, keepdim=True)
+        square = self.weight * base.square()
+        b_one, b_two, b_none = square @ atoms.pictures.T, square @ atoms.squares.T, square.sum(1, keepdim=True)
+        determinant = (b_none * b_two - b_one.square()).clamp(min=1e-12)
+        dark = ((b_two * flat - b_one * straight) / determinant).clamp(min=0.0)
+        lit = ((straight - b_one * dark) / b_two.clamp(min=1e-12)).clamp(min=0.0)
+        # one ambient for all channels, then the best brightness of each
+        ambient = (dark.sum(0) / (dark + lit).sum(0).clamp(min=1e-9)).clamp(0.0, 1.0)
+        top = ambient * flat + (1.0 - ambient) * straight
+        bottom = ambient.square() * b_none + 2.0 * ambient * (1.0 - ambient) * b_one + (1.0 - ambient).square() * b_two
+        scale = top / bottom.clamp(min=1e-12)
+        now = (self.weight * residual.square()).sum(1, keepdim=True)
+        after = (self.weight * wanted.square()).sum(1, keepdim=True) - scale * top
+        saved = (now - after).sum(0) / 3.0
         moves = []
-        for k in self._best(atoms, saved, 2):
-            shade = atoms.leaves[k].set(ambient=1.0 - float(strength[k]))
-            moves.append(self._move(root, place, add_shade(place.node, shade), family, float(saved[k])))
+        for k in self._best(atoms, saved, 3):
+            shaded = add_shade(recolored(place.node, scale[:, k].tolist()), atoms.leaves[k].set(ambient=float(ambient[k])))
+            moves.append(self._move(root, place, shaded, family, float(saved[k])))
         return moves
 
     def _move(self, root: Node, place: _Place, node: Node, family: str, gain: float) -> Move:
         grown = replace(root, place.address, node)
         cost = count_values(grown) - self.size
-        after = max(self.error - gain, 1e-3 * self.error)
+        after = max(self.error - gain, 1e-3 * self.error, 1e-12)
         relative = float(torch.tensor(self.error / after).log()) / max(cost, 1)
         return Move(grown, family, place.address, gain, cost, relative)
 
@@ -240,9 +264,10 @@ def swaps(root: Node) -> list[Node]:
         pair = tint(node)
         if pair and pair[1].kind == "rim":
             found.append(replace(root, address, pair[1]))
-        if pair and KINDS[pair[1].kind].amplitude:
-            grey = sum(pair[0]["color"]) / 3.0  # type: ignore[arg-type]
-            found.append(replace(root, address, pair[1].set(**{KINDS[pair[1].kind].amplitude: min(grey, 1.0)})))  # type: ignore[dict-item]
+        scale = KINDS[pair[1].kind].amplitude if pair else None
+        if pair and scale:
+            grey = sum(pair[0]["color"]) / 3.0
+            found.append(replace(root, address, pair[1].set(**{scale: min(grey, 1.0)})))
         if not isinstance(node, Leaf):
             continue
         for other in _relatives(node):
@@ -250,7 +275,7 @@ def swaps(root: Node) -> list[Node]:
         amplitude = KINDS[node.kind].amplitude
         parent = address.rsplit(".", 2)
         if amplitude and len(parent) == 3 and parent[0].rpartition(".")[2] == "screen":
-            strength = min(node[amplitude][0], 1.0)  # type: ignore[operator]
+            strength = min(node[amplitude][0], 1.0)
             found.append(replace(root, address, multiply(leaf("albedo", color=(strength,) * 3), node.set(**{amplitude: 1.0}))))
     return found
 
@@ -260,20 +285,23 @@ def _relatives(node: Leaf) -> list[Leaf]:
     direction = node["direction"] if node.kind not in ("albedo", "image", "image_mask", "environment_map") else None
     match node.kind:
         case "highlight":
-            sharpness, amplitude = node["sharpness"][0], node["amplitude"][0]  # type: ignore[index]
+            sharpness, amplitude = node["sharpness"][0], node["amplitude"][0]
             radius = min(0.8 / math.sqrt(sharpness), 1.5)
             return [leaf("toon_highlight", direction=direction, radius=radius, brightness=min(amplitude, 1.0), softness=min(radius, 2.0))]
         case "toon_highlight":
-            sharpness = min(max(0.7 / max(node["radius"][0], 0.01) ** 2, 0.1), 2000.0)  # type: ignore[operator]
+            sharpness = min(max(0.7 / max(node["radius"][0], 0.01) ** 2, 0.1), 2000.0)
             return [leaf("highlight", direction=direction, sharpness=sharpness, amplitude=node["brightness"][0])]
         case "diffuse":
             return [leaf("toon_diffuse", direction=direction, ambient=node["ambient"][0], threshold=-0.2, softness=1.3)]
         case "toon_diffuse":
             return [leaf("diffuse", direction=direction, ambient=node["ambient"][0])]
         case "stripe":
-            edge = node["center"][0] - 0.5 * node["width"][0]  # type: ignore[operator]
+            edge = node["center"][0] - 0.5 * node["width"][0]
             return [leaf("threshold", direction=direction, threshold=edge, softness=node["softness"][0])]
         case "threshold":
-            return [leaf("stripe", direction=direction, center=min(node["threshold"][0] + 0.5, 1.0), width=1.0, softness=node["softness"][0])] if abs(node["threshold"][0]) < 0.9 else []  # type: ignore[operator, arg-type]
+            edge = node["threshold"][0]
+            if abs(edge) >= 0.9:
+                return []
+            return [leaf("stripe", direction=direction, center=min(edge + 0.5, 1.0), width=1.0, softness=node["softness"][0])]
         case _:
             return []

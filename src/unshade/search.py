@@ -18,14 +18,18 @@ import torch
 
 from unshade.atoms import Dictionary
 from unshade.fit.fitted import Fitted
-from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, Model, fit_pixels
+from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, Model, fit_pixels, sharpen
 from unshade.fit.pixels import Pixels
 from unshade.moves import Move, Proposer, removals, swaps
-from unshade.nodes import Leaf, Node, count_values, leaf, replace, walk
+from unshade.nodes import Leaf, Node, count_values, leaf
 
-PLAIN = ("plain_lights", "plain_masks", "plain_shades", "spots")
+PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots")
+"""The families of the released grammar: all lights grey, edges drawn."""
 DRAWN = 1.0e-5
 """A plain tree with a mean squared error under this one is the answer: the picture was drawn with such a tree."""
+
+LARGEST_DRAWN = 48
+"""Values of the largest tree of the released grammar, about."""
 
 PHOTOGRAPHIC = 1.0e-3
 """A plain tree over this error is given up: the picture was not drawn with one."""
@@ -133,6 +137,7 @@ class Search:
     def run(self) -> Iterator[tuple[str, Candidate]]:
         """(stage, candidate) as they come; the last one is the result."""
         with torch.no_grad():
+            plain: Candidate | None = None
             if self.effort.beam and not self.skip:
                 plain = yield from self._plain()
                 if plain.error < DRAWN:
@@ -152,7 +157,10 @@ class Search:
                 if self.judge(better.error, better.values) < self.judge(current.error, current.values):
                     current = better
                     yield "exchange", current
-            yield "polish", self._polish(current)
+            current = self._sharpen(current)
+            if plain and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
+                current = plain
+            yield "polish", current
 
     def _plain(self) -> Generator[tuple[str, Candidate], None, Candidate]:
         """Beam search with only the words of the released grammar, which a drawn or sampled picture may be made of."""
@@ -165,7 +173,7 @@ class Search:
             for state in states:
                 model = Model(state.root, pixels)
                 moves = proposer.propose(model, model.layout.pack(state.root), PLAIN, effort.beam_moves)
-                options += [self._coarse(move.root, effort.trial_steps) for move in moves if move.cost <= effort.max_values - state.values]
+                options += [self._coarse(move.root, effort.trial_steps) for move in moves if move.cost <= min(effort.max_values, LARGEST_DRAWN) - state.values]
             states = [self._coarse(option.root, 8) for option in distinct(sorted(options, key=self._drawn), effort.beam, each=2)]
             if not states:
                 break
@@ -216,15 +224,8 @@ class Search:
         return found
 
     def _sharpen(self, current: Candidate) -> Candidate:
-        """Fit on the fine points with edges about a pixel wide, then make edges hard where that is no worse."""
-        fitted = fit_pixels(self.samples.fine, current.root, steps=self.effort.polish_steps, softest=FINE_SOFTNESS)
-        hard = harden(fitted.root, 2.0 * FINE_SOFTNESS)
-        if hard is not fitted.root:
-            model = Model(hard, self.samples.fine)
-            values = model.evaluate(model.layout.pack(hard))
-            error = float(((model.compose(values) - self.samples.fine.target).square() * self.samples.fine.weight).sum()) / 3.0
-            if error < fitted.error:
-                return Candidate(hard, error)
+        """Fit on the fine points, edges about a pixel wide, then hard where that is better."""
+        fitted = sharpen(self.samples.fine, current.root, steps=self.effort.polish_steps)
         return Candidate(fitted.root, fitted.error)
 
     def _start(self) -> Node:
@@ -264,24 +265,24 @@ class Search:
 
     def _try(self, moves: list[Move], pixels: Pixels, error: float) -> Candidate | None:
         """Short fits of the most promising moves; a full one of the best, if it pays."""
-        best: tuple[float, Node] | None = None
-        for move in moves[: self.effort.trials]:
-            fitted = fit_pixels(pixels, move.root, steps=self.effort.trial_steps, softest=FINE_SOFTNESS)
-            pays = math.log((error + FLOOR) / (fitted.error + FLOOR)) / max(move.cost, 1)
-            if best is None or pays > best[0]:
-                best = (pays, fitted.root)
-        if best is None or best[0] < self.effort.price:
-            return None
-        return self._fit(best[1], pixels, self.effort.growth_steps)
+        for first in range(0, len(moves), self.effort.trials):
+            best = (0.0, moves[0].root)
+            for move in moves[first : first + self.effort.trials]:
+                fitted = fit_pixels(pixels, move.root, steps=self.effort.trial_steps, softest=FINE_SOFTNESS)
+                pays = math.log((error + FLOOR) / (fitted.error + FLOOR)) / max(move.cost, 1)
+                best = max(best, (pays, fitted.root), key=lambda option: option[0])
+            if best[0] >= self.effort.price:
+                return self._fit(best[1], pixels, self.effort.growth_steps)
+        return None
 
     def _sweep(self, current: Candidate, pixels: Pixels) -> Candidate:
-        """Offer every leaf another kind, or none at all, until nothing pays. Never makes a tree larger."""
+        """Offer every leaf another kind, or none at all, until nothing pays."""
         current = self._fit(current.root, pixels, self.effort.growth_steps)
         for _ in range(self.effort.sweep_steps):
             score = self.judge(current.error, current.values)
             options = []
             for root in removals(current.root) + swaps(current.root):
-                if count_values(root) <= current.values:
+                if count_values(root) <= min(current.values + 2, self.effort.max_values):
                     quick = fit_pixels(pixels, root, steps=4, softest=FINE_SOFTNESS)
                     options.append(Candidate(quick.root, quick.error))
             options.sort(key=lambda option: self.judge(option.error, option.values))
@@ -306,9 +307,6 @@ class Search:
         *_, regrown = [smaller, *self._grow(smaller, pixels, self.samples.points_dictionary, FLOOR)]
         return regrown
 
-    def _polish(self, current: Candidate) -> Candidate:
-        return self._sharpen(current)
-
 
 def distinct(candidates: list[Candidate], most: int, each: int = 1) -> list[Candidate]:
     """The first candidates, at most ``each`` of one structure."""
@@ -328,11 +326,3 @@ def outline(root: Node) -> str:
         return root.kind
     below = ",".join(outline(child) for child in root.children)
     return f"{root.kind}({below}{'|' + root.mask.kind if root.mask else ''})"
-
-
-def harden(root: Node, softest: float) -> Node:
-    """The tree with every edge of about a pixel made hard."""
-    for address, node in walk(root):
-        if isinstance(node, Leaf) and node.kind in ("threshold", "stripe", "toon_highlight") and node["softness"][0] <= softest:
-            root = replace(root, address, node.set(softness=0.0))
-    return root

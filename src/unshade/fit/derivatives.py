@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import torch
 import torch.autograd.forward_ad as forward_ad
+import torch.nn.functional as F
 
 from unshade.nodes import KINDS
 from unshade.shading import SHARPEST_EDGE
@@ -81,6 +82,25 @@ def stripe(
 ANALYTIC: dict[str, Callable[..., Derivatives]] = {
     function.__name__: function for function in (diffuse, highlight, rim, toon_diffuse, toon_highlight, threshold, stripe)
 }
+
+
+def environment(
+    mirrored: torch.Tensor, value: torch.Tensor, direction: Params, sharpness: Params, color: Params, basis: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Derivatives of one environment leaf of L lobes by its directions' tangents, its sharpnesses and its colours.
+
+    Args:
+        mirrored: (3, N) mirror directions. value: (3, N) of the leaf. direction, color: (L, 3). sharpness: (L, 1).
+        basis: (L, 2, 3) tangents of the directions.
+    Returns:
+        (L, 2, 3, N), (L, 3, N) and (L, N), the last the derivative of each channel by its own colour.
+    """
+    toward = F.normalize(direction, dim=-1) @ mirrored
+    lobe = torch.exp(-2.0 * sharpness * (1.0 - toward))
+    shown = (value < 1.0).to(value.dtype)
+    colored = color[..., None] * lobe[:, None] * shown
+    across = torch.matmul(basis, mirrored)
+    return 2.0 * sharpness[..., None, None] * across[:, :, None] * colored[:, None], 2.0 * (toward - 1.0)[:, None] * colored, lobe
 
 
 def forward_mode(kind: str, normals: torch.Tensor, parameters: list[torch.Tensor], tangents: list[torch.Tensor]) -> torch.Tensor:

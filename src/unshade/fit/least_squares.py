@@ -10,19 +10,20 @@ their bounds are held there while the gradient pushes outwards.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 
 from unshade.blend import BLENDS
-from unshade.fit.derivatives import ANALYTIC, forward_mode
+from unshade.fit.derivatives import ANALYTIC, environment, forward_mode
 from unshade.fit.fitted import Fitted
 from unshade.fit.pixels import Pixels
-from unshade.nodes import KINDS, Leaf, Node, Operator, Raster
+from unshade.nodes import KINDS, Leaf, Node, Operator, Raster, replace, walk
 from unshade.parameters import Layout
 from unshade.shading import facing
+from unshade.sphere import reflect
 from unshade.types import Image, Mask
-
 
 COARSE_SIZE = 40
 """Pictures are averaged down to this many pixels a side where edges do not matter yet."""
@@ -32,8 +33,44 @@ FINE_SOFTNESS = 0.012
 """Narrowest edges while fitting, about 1.5 pixels of a picture of 256: a narrower one has no slope that a pixel could see."""
 
 
+EDGE = ("direction", "threshold", "center", "width", "radius", "softness")
+"""Parameters that place an edge. A hard edge has no slope, so a fit leaves its place alone; `soften` it to move it."""
+
+
+def is_hard(leaf: Leaf) -> bool:
+    """True for a mask or a toon leaf whose edge is a step."""
+    return any(parameter.name == "softness" for parameter in KINDS[leaf.kind].parameters) and leaf["softness"] == (0.0,)
+
+
+def soften(root: Node, softness: float) -> Node:
+    """The tree with every hard edge made this wide."""
+    for address, node in walk(root):
+        if isinstance(node, Leaf) and is_hard(node):
+            root = replace(root, address, node.set(softness=softness))
+    return root
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Leaves of one kind with the same free numbers, evaluated and differentiated as one batch."""
+
+    kind: str
+    leaves: tuple[int, ...]
+    index: tuple[torch.Tensor, ...]
+    """One (K, n) index into the flat vector a parameter."""
+    pattern: tuple[tuple[int, int, int], ...]
+    """(parameter, offset in it, tangent 0 or 1, or -1 for a plain number) of each free column of a leaf."""
+    first: int
+    """First row in the Jacobian; K * len(pattern) rows follow, leaf by leaf."""
+
+
 class Model:
-    """A structure at given pixels: values, gains and Jacobian."""
+    """A structure at given pixels: values, gains and Jacobian.
+
+    Args:
+        root: the structure. pixels: where. locked: addresses of leaves, subtrees or ``address.parameter`` that are kept.
+        softest: least softness of an edge.
+    """
 
     def __init__(self, root: Node, pixels: Pixels, locked: Collection[str] = (), softest: float = 0.0) -> None:
         self.root, self.pixels = root, pixels
@@ -43,9 +80,8 @@ class Model:
         self.leaves: list[Leaf] = []
         self.addresses: list[str] = []
         self._collect(root, root.kind)
-        self._columns(frozenset(locked))
-        soft = torch.tensor([self.layout.names[k].endswith(".softness") for k in self.number.tolist()], dtype=torch.bool)
-        self.low = torch.where(soft, self.low.clamp(min=softest), self.low)
+        self.groups = self._grouped(frozenset(locked))
+        self._columns(softest)
 
     def _collect(self, node: Node, address: str) -> None:
         if isinstance(node, Leaf):
@@ -57,67 +93,76 @@ class Model:
         if node.mask is not None:
             self._collect(node.mask, f"{address}.mask")
 
-    def _columns(self, locked: frozenset[str]) -> None:
-        """Give every free number a column: two a direction, one for any other."""
-        layout = self.layout
-        self.columns: list[list[tuple[int, int]]] = []  # per leaf: (number, tangent 0/1 or -1)
-        for leaf, address, slots in zip(self.leaves, self.addresses, layout.slots, strict=True):
-            own: list[tuple[int, int]] = []
-            held = any(address == where or address.startswith(where + ".") for where in locked)
-            for parameter, slot in zip(KINDS[leaf.kind].parameters, slots, strict=True):
-                if held or f"{address}.{parameter.name}" in locked:
-                    continue
-                if parameter.type == "direction":
-                    own += [(start, tangent) for start in range(slot.start, slot.stop, 3) for tangent in (0, 1)]
-                else:
-                    own += [(number, -1) for number in range(slot.start, slot.stop) if layout.free[number]]
-            self.columns.append(own)
-        flat = [column for own in self.columns for column in own]
-        self.free = len(flat)
-        self.first = [0]
-        for own in self.columns:
-            self.first.append(self.first[-1] + len(own))
-        number = torch.tensor([n for n, _ in flat], dtype=torch.long)
-        tangent = torch.tensor([t for _, t in flat], dtype=torch.long)
-        self.number, self.plain = number, tangent < 0
-        self.log = layout.logarithmic[number] & self.plain if self.free else self.plain
-        self.directions = number[tangent == 0]
-        self.low = torch.where(self.plain, layout.lower[number], -torch.inf) if self.free else layout.lower[:0]
-        self.high = torch.where(self.plain, layout.upper[number], torch.inf) if self.free else layout.upper[:0]
-        groups: dict[str, list[int]] = {}
-        for k, leaf in enumerate(self.leaves):
-            groups.setdefault(leaf.kind if not KINDS[leaf.kind].repeats and KINDS[leaf.kind].parameters[0].type != "raster" else f"{leaf.kind}#{k}", []).append(k)
-        self.groups = list(groups.values())
-        self.index = [
-            [torch.tensor([range(*self.layout.slots[k][p].indices(layout.size)) for k in group], dtype=torch.long) for p in range(len(KINDS[self.leaves[group[0]].kind].parameters))]
-            for group in self.groups
-        ]
+    def _pattern(self, k: int, locked: frozenset[str]) -> tuple[tuple[int, int, int], ...]:
+        """The free columns of one leaf: two a direction, one for any other number that is not held."""
+        address, leaf = self.addresses[k], self.leaves[k]
+        if any(address == where or address.startswith(where + ".") for where in locked):
+            return ()
+        hard = is_hard(leaf)
+        own: list[tuple[int, int, int]] = []
+        for p, (parameter, slot) in enumerate(zip(KINDS[leaf.kind].parameters, self.layout.slots[k], strict=True)):
+            if f"{address}.{parameter.name}" in locked or (hard and parameter.name in EDGE):
+                continue
+            if parameter.type == "direction":
+                own += [(p, offset, tangent) for offset in range(0, slot.stop - slot.start, 3) for tangent in (0, 1)]
+            else:
+                own += [(p, offset, -1) for offset in range(slot.stop - slot.start) if self.layout.free[slot.start + offset]]
+        return tuple(own)
 
-    def _arguments(self, group: list[int], index: list[torch.Tensor], numbers: torch.Tensor) -> list[torch.Tensor]:
+    def _grouped(self, locked: frozenset[str]) -> list[_Group]:
+        batches: dict[tuple, list[int]] = {}
+        for k, leaf in enumerate(self.leaves):
+            kind = KINDS[leaf.kind]
+            alone = kind.repeats or any(parameter.type == "raster" for parameter in kind.parameters)
+            batches.setdefault((leaf.kind, self._pattern(k, locked), k if alone else -1), []).append(k)
+        groups, first = [], 0
+        for (kind_name, pattern, _), members in batches.items():
+            index = tuple(
+                torch.tensor([list(range(slot.start, slot.stop)) for slot in (self.layout.slots[k][p] for k in members)], dtype=torch.long)
+                for p in range(len(KINDS[kind_name].parameters))
+            )
+            groups.append(_Group(kind_name, tuple(members), index, pattern, first))
+            first += len(members) * len(pattern)
+        self.free = first
+        return groups
+
+    def _columns(self, softest: float) -> None:
+        """What each row of the Jacobian moves, and its bounds."""
+        layout = self.layout
+        flat = [(layout.slots[k][p].start + offset, tangent) for group in self.groups for k in group.leaves for p, offset, tangent in group.pattern]
+        self.number = torch.tensor([number for number, _ in flat], dtype=torch.long)
+        self.plain = torch.tensor([tangent < 0 for _, tangent in flat], dtype=torch.bool)
+        self.log = layout.logarithmic[self.number] & self.plain
+        self.linear = self.plain & ~self.log
+        self.directions = self.number[torch.tensor([tangent == 0 for _, tangent in flat], dtype=torch.bool)]
+        self.spread = self.directions[:, None] + torch.arange(3)
+        self.tangential = torch.tensor([row for row, (_, tangent) in enumerate(flat) if tangent >= 0], dtype=torch.long)
+        soft = torch.tensor([layout.names[number].endswith(".softness") for number, _ in flat], dtype=torch.bool)
+        low = torch.where(soft, layout.lower[self.number].clamp(min=softest), layout.lower[self.number])
+        self.low = torch.where(self.plain, low, -torch.inf)
+        self.high = torch.where(self.plain, layout.upper[self.number], torch.inf)
+
+    def _arguments(self, group: _Group, numbers: torch.Tensor) -> list[torch.Tensor]:
         """One (K, n) tensor a parameter; (1, lobes, n) for a kind that repeats; a raster as (1, C, h, w)."""
-        kind = KINDS[self.leaves[group[0]].kind]
+        kind = KINDS[group.kind]
         arguments = []
-        for p, parameter in enumerate(kind.parameters):
-            stored = self.leaves[group[0]].values[p]
+        for parameter, stored, index in zip(kind.parameters, self.leaves[group.leaves[0]].values, group.index, strict=True):
             if isinstance(stored, Raster):
                 arguments.append(stored.tensor(numbers.device, numbers.dtype)[None])
             else:
-                taken = numbers[index[p]]
-                arguments.append(taken.unflatten(-1, (-1, parameter.size)) if kind.repeats else taken)
+                arguments.append(numbers[index].unflatten(-1, (-1, parameter.size)) if kind.repeats else numbers[index])
         return arguments
 
     def evaluate(self, vector: torch.Tensor) -> list[torch.Tensor]:
         """Every leaf's picture, (1 or 3, N) or (3, 1) for an albedo, in leaf order."""
         numbers = vector.to(self.normals.dtype)
         values: list[torch.Tensor] = [numbers] * len(self.leaves)
-        for group, index in zip(self.groups, self.index, strict=True):
-            kind = self.leaves[group[0]].kind
-            if kind == "albedo":
-                for k, color in zip(group, numbers[index[0]], strict=True):
-                    values[k] = color[:, None]
-                continue
-            found = KINDS[kind].formula(self.normals, *self._arguments(group, index, numbers))[..., 0, :]
-            for k, value in zip(group, found, strict=True):
+        for group in self.groups:
+            if group.kind == "albedo":
+                found = numbers[group.index[0]][..., None]
+            else:
+                found = KINDS[group.kind].formula(self.normals, *self._arguments(group, numbers))[..., 0, :]
+            for k, value in zip(group.leaves, found.unbind(0), strict=True):
                 values[k] = value
         return values
 
@@ -165,84 +210,86 @@ class Model:
     def jacobian(self, vector: torch.Tensor, values: list[torch.Tensor]) -> torch.Tensor:
         """d picture / d free coordinates, (F, 3, N)."""
         count = self.pixels.count
-        gain = {address: g for address, _, _, g in self.nodes(values)}
-        jacobian = torch.zeros(self.free, 3, count, dtype=self.normals.dtype)
+        gains = {address: gain for address, node, _, gain in self.nodes(values) if isinstance(node, Leaf)}
+        jacobian = torch.empty(self.free, 3, count, dtype=self.normals.dtype)
         numbers = vector.to(self.normals.dtype)
         basis = self.tangents(vector).to(self.normals.dtype)
-        for group, index in zip(self.groups, self.index, strict=True):
-            name = self.leaves[group[0]].kind
-            wanted = [k for k in group if self.columns[k]]
-            if not wanted:
+        for group in self.groups:
+            if not group.pattern:
                 continue
-            if name == "albedo":
-                for k in wanted:
-                    g = torch.as_tensor(gain[self.addresses[k]], dtype=numbers.dtype).expand(3, count)
-                    for column, (number, _) in enumerate(self.columns[k], self.first[k]):
-                        channel = number - int(self.layout.slots[k][0].start)
-                        jacobian[column, channel] = g[channel]
-            elif name in ANALYTIC:
-                self._analytic(name, group, index, numbers, values, basis, gain, jacobian)
+            rows, width = len(group.leaves), len(group.pattern)
+            block = jacobian[group.first : group.first + rows * width].view(rows, width, 3, count)
+            gain = torch.stack([torch.as_tensor(gains[self.addresses[k]], dtype=numbers.dtype).expand(3, count) for k in group.leaves])
+            if group.kind == "albedo":
+                block.zero_()
+                for column, (_, channel, _) in enumerate(group.pattern):
+                    block[:, column, channel] = gain[:, channel]
+            elif group.kind in ANALYTIC:
+                torch.mul(self._analytic(group, numbers, values, basis)[:, :, None], gain[:, None], out=block)
+            elif group.kind == "environment":
+                torch.mul(self._environment(group, numbers, values, basis), gain, out=block[0])
             else:
-                self._automatic(name, group, index, numbers, basis, gain, jacobian)
+                torch.mul(self._automatic(group, numbers, basis), gain[:, None], out=block)
         return jacobian
 
     def tangents(self, vector: torch.Tensor) -> torch.Tensor:
         """Two unit vectors across the direction that starts at each number of the vector, (P, 2, 3); zero elsewhere."""
         basis = torch.zeros(vector.shape[0], 2, 3, dtype=vector.dtype)
         if len(self.directions):
-            direction = torch.stack([vector[self.directions + k] for k in range(3)], dim=-1)
-            direction = F.normalize(direction, dim=-1)
+            direction = F.normalize(vector[self.spread], dim=-1)
             helper = torch.where(direction[:, 2:].abs() < 0.9, direction.new_tensor([[0.0, 0.0, 1.0]]), direction.new_tensor([[1.0, 0.0, 0.0]]))
             first = F.normalize(torch.linalg.cross(helper, direction), dim=-1)
             basis[self.directions] = torch.stack([first, torch.linalg.cross(direction, first)], dim=1)
         return basis
 
-    def _analytic(self, name, group, index, numbers, values, basis, gain, jacobian) -> None:  # type: ignore[no-untyped-def]
-        arguments = self._arguments(group, index, numbers)
+    def _analytic(self, group: _Group, numbers: torch.Tensor, values: list[torch.Tensor], basis: torch.Tensor) -> torch.Tensor:
+        """Derivatives of grey leaves by their own free columns, (K, columns, N)."""
+        arguments = self._arguments(group, numbers)
         toward = facing(self.normals, arguments[0])[:, 0, 0, :]
-        value = torch.stack([values[k][0] for k in group])
-        slope, *partials = ANALYTIC[name](value, toward, self.grazing, *arguments[1:])
-        across = torch.einsum("ktd,dn->ktn", basis[index[0][:, 0]], self.pixels.normals)
-        own = {-1: None, 0: across[:, 0] * slope, 1: across[:, 1] * slope}
-        for row, k in enumerate(group):
-            g = gain[self.addresses[k]]
-            start = int(self.layout.slots[k][0].start)
-            for column, (number, tangent) in enumerate(self.columns[k], self.first[k]):
-                derivative = own[tangent][row] if tangent >= 0 else partials[number - start - 3][row]
-                torch.mul(derivative.expand(3, -1), g, out=jacobian[column])
+        value = torch.stack([values[k][0] for k in group.leaves])
+        slope, *partials = ANALYTIC[group.kind](value, toward, self.grazing, *arguments[1:])
+        across = torch.matmul(basis[group.index[0][:, 0]], self.pixels.normals) * slope[:, None]
+        columns = [across[:, tangent] if tangent >= 0 else partials[p - 1] for p, _, tangent in group.pattern]
+        return torch.stack([column.expand_as(toward) for column in columns], dim=1)
 
-    def _automatic(self, name, group, index, numbers, basis, gain, jacobian) -> None:  # type: ignore[no-untyped-def]
-        kind = KINDS[name]
-        for row, k in enumerate(group):
-            arguments = [a[row : row + 1] for a in self._arguments(group, index, numbers)]
-            tangents = [a.new_zeros(len(self.columns[k]), *a.shape) for a in arguments]
-            for d, (number, tangent) in enumerate(self.columns[k]):
-                p = next(p for p, slot in enumerate(self.layout.slots[k]) if slot.start <= number < slot.stop)
-                flat = tangents[p][d].view(-1)
-                offset = number - self.layout.slots[k][p].start
-                if tangent >= 0:
-                    flat[offset : offset + 3] = basis[number, tangent]
-                else:
-                    flat[offset] = 1.0
-            found = forward_mode(kind.name, self.normals, arguments, tangents)[:, 0]
-            first = self.first[k]
-            jacobian[first : first + len(found)] = found * gain[self.addresses[k]]
+    def _environment(self, group: _Group, numbers: torch.Tensor, values: list[torch.Tensor], basis: torch.Tensor) -> torch.Tensor:
+        """Derivatives of an environment by its own free columns, (columns, 3, N)."""
+        arguments = [argument[0] for argument in self._arguments(group, numbers)]
+        value = values[group.leaves[0]]
+        mirrored = reflect(self.normals)[:, 0]
+        turned, sharpened, lobe = environment(mirrored, value, *arguments, basis[group.index[0][0, ::3]])
+        columns = torch.zeros(len(group.pattern), 3, mirrored.shape[1], dtype=mirrored.dtype)
+        for column, (p, offset, tangent) in enumerate(group.pattern):
+            if tangent >= 0:
+                columns[column] = turned[offset // 3, tangent]
+            elif p == 1:
+                columns[column] = sharpened[offset]
+            else:
+                columns[column, offset % 3] = lobe[offset // 3] * (value[offset % 3] < 1.0)
+        return columns
+
+    def _automatic(self, group: _Group, numbers: torch.Tensor, basis: torch.Tensor) -> torch.Tensor:
+        """Derivatives of any leaves by their own free columns, (K, columns, 1 or 3, N)."""
+        arguments = self._arguments(group, numbers)
+        tangents = [argument.new_zeros(len(group.pattern), *argument.shape) for argument in arguments]
+        for d, (p, offset, tangent) in enumerate(group.pattern):
+            flat = tangents[p][d].view(len(group.leaves), -1)
+            if tangent >= 0:
+                flat[:, offset : offset + 3] = basis[group.index[p][:, offset], tangent]
+            else:
+                flat[:, offset] = 1.0
+        return forward_mode(group.kind, self.normals, arguments, tangents).transpose(0, 1)
 
     def move(self, vector: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """The vector after a step in the free coordinates, inside its bounds."""
         moved = vector.clone()
-        plain, log = self.plain & ~self.log, self.log
-        moved[self.number[plain]] += step[plain]
-        moved[self.number[log]] *= step[log].clamp(-1.5, 1.5).exp()
+        moved[self.number[self.linear]] += step[self.linear]
+        moved[self.number[self.log]] *= step[self.log].clamp(-1.5, 1.5).exp()
         kept = self.number[self.plain]
         moved[kept] = moved[kept].clamp(self.low[self.plain], self.high[self.plain])
         if len(self.directions):
-            offset = (step[~self.plain].view(-1, 2, 1) * self.tangents(vector)[self.directions]).sum(1)
-            for k in range(3):
-                moved[self.directions + k] += offset[:, k]
-            length = sum(moved[self.directions + k].square() for k in range(3)).sqrt()  # type: ignore[union-attr]
-            for k in range(3):
-                moved[self.directions + k] /= length
+            offset = (step[self.tangential].view(-1, 2, 1) * self.tangents(vector)[self.directions]).sum(1)
+            moved[self.spread] = F.normalize(vector[self.spread] + offset, dim=-1)
         return moved
 
     def scale(self, vector: torch.Tensor) -> torch.Tensor:
@@ -250,7 +297,9 @@ class Model:
         return torch.where(self.log, vector[self.number], torch.ones_like(vector[self.number]))
 
 
-def minimise(model: Model, vector: torch.Tensor, steps: int, tolerance: float = 1e-4, damping: float = 1e-2) -> tuple[torch.Tensor, float, list[float]]:
+def minimise(
+    model: Model, vector: torch.Tensor, steps: int, tolerance: float = 1e-4, damping: float = 1e-2
+) -> tuple[torch.Tensor, float, list[float]]:
     """Levenberg-Marquardt with Marquardt's scaling and bounds.
 
     Args:
@@ -312,7 +361,9 @@ def minimise(model: Model, vector: torch.Tensor, steps: int, tolerance: float = 
     return vector, error, history
 
 
-def fit_pixels(pixels: Pixels, root: Node, *, locked: Collection[str] = (), steps: int = 30, tolerance: float = 1e-4, softest: float = 0.0) -> Fitted:
+def fit_pixels(
+    pixels: Pixels, root: Node, *, locked: Collection[str] = (), steps: int = 30, tolerance: float = 1e-4, softest: float = 0.0
+) -> Fitted:
     """Fit the parameters of a structure at given pixels, from the tree's own numbers."""
     with torch.no_grad():
         model = Model(root, pixels, locked, softest)
@@ -320,6 +371,30 @@ def fit_pixels(pixels: Pixels, root: Node, *, locked: Collection[str] = (), step
         start[model.number] = torch.where(model.plain, start[model.number].clamp(model.low, model.high), start[model.number])
         vector, error, history = minimise(model, start, steps, tolerance)
         return Fitted(model.layout.unpack(root, vector), error, tuple(history))
+
+
+def sharpen(pixels: Pixels, root: Node, *, locked: Collection[str] = (), steps: int = 30) -> Fitted:
+    """Fit with edges about a pixel wide, then make hard every edge that is better hard."""
+    fitted = fit_pixels(pixels, soften(root, FINE_SOFTNESS), locked=locked, steps=steps, softest=FINE_SOFTNESS)
+    root, error = fitted.root, fitted.error
+    for address, node in walk(fitted.root):
+        if isinstance(node, Leaf) and any(p.name == "softness" for p in KINDS[node.kind].parameters) and node["softness"][0] < 2.0 * FINE_SOFTNESS:  # type: ignore[operator]
+            hard = replace(root, address, node.set(softness=0.0))
+            hard_error = error_of(pixels, hard)
+            if hard_error < error:
+                root, error = hard, hard_error
+    if root is not fitted.root:
+        again = fit_pixels(pixels, root, locked=locked, steps=steps // 2)
+        root, error = again.root, again.error
+    return Fitted(root, error, fitted.history)
+
+
+def error_of(pixels: Pixels, root: Node) -> float:
+    """Mean squared error of a tree at given pixels."""
+    with torch.no_grad():
+        model = Model(root, pixels)
+        values = model.evaluate(model.layout.pack(root))
+        return float(((model.compose(values) - pixels.target).square() * pixels.weight).double().sum()) / 3.0
 
 
 def fit_least_squares(
@@ -334,5 +409,6 @@ def fit_least_squares(
         The tree and its mean squared error on the points.
     """
     if target.shape[-1] > COARSE_SIZE:
+        root = soften(root, COARSE_SOFTNESS)
         root = fit_pixels(Pixels.of(target, mask, COARSE_SIZE), root, locked=locked, steps=steps, softest=COARSE_SOFTNESS).root
-    return fit_pixels(Pixels.important(target, mask, count, seed), root, locked=locked, steps=steps)
+    return sharpen(Pixels.important(target, mask, count, seed), root, locked=locked, steps=steps)
