@@ -54,7 +54,7 @@ def _render(leaves: list[Leaf], normals: torch.Tensor) -> Atoms:
 
 
 def lights() -> list[Leaf]:
-    """Highlights from broad to as small as a few pixels, and rims."""
+    """Highlights from broad to as small as a few pixels."""
     found = []
     for sharpness, count, lowest in (
         (0.3, 24, -0.6),
@@ -66,11 +66,6 @@ def lights() -> list[Leaf]:
         (110.0, 420, 0.0),
     ):
         found += [leaf("highlight", direction=d, sharpness=sharpness) for d in directions(count, lowest).tolist()]
-    for exponent in (0.7, 1.5, 3.0, 7.0):
-        for k in range(16):
-            angle = 2.0 * math.pi * k / 16
-            for z in (0.0, 0.6):
-                found.append(leaf("rim", direction=(math.cos(angle), math.sin(angle), z), exponent=exponent))
     return found
 
 
@@ -116,11 +111,11 @@ def shades() -> list[Leaf]:
 
 
 def plain_lights() -> list[Leaf]:
-    """Highlights as the paper's grammar draws them, and its rims."""
+    """Highlights as the released grammar draws them."""
     found = []
     for sharpness, count, lowest in ((20.0, 200, -0.1), (50.0, 320, 0.0), (100.0, 420, 0.0)):
         found += [leaf("highlight", direction=d, sharpness=sharpness) for d in directions(count, lowest).tolist()]
-    return found + [leaf("rim", direction=d, exponent=1.0) for d in directions(60, -0.2).tolist()]
+    return found
 
 
 def plain_masks() -> list[Leaf]:
@@ -142,7 +137,25 @@ def plain_shades() -> list[Leaf]:
     return found
 
 
+def rims() -> list[Leaf]:
+    """Light at the silhouette, wide and narrow."""
+    found = []
+    for exponent in (0.7, 1.5, 3.0, 7.0):
+        for k in range(16):
+            angle = 2.0 * math.pi * k / 16
+            for z in (0.0, 0.6):
+                found.append(leaf("rim", direction=(math.cos(angle), math.sin(angle), z), exponent=exponent))
+    return found
+
+
+def plain_rims() -> list[Leaf]:
+    """The rims of the released grammar."""
+    return [leaf("rim", direction=d, exponent=1.0) for d in directions(90, -0.2).tolist()]
+
+
 FAMILIES = {
+    "rims": rims,
+    "plain_rims": plain_rims,
     "plain_lights": plain_lights,
     "plain_spots": spots,
     "plain_masks": plain_masks,

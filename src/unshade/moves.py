@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 
 from unshade.atoms import Atoms, Dictionary
-from unshade.fit.least_squares import Model
+from unshade.fit.model import Model
 from unshade.nodes import KINDS, Leaf, Node, Operator, Role, count_values, find, leaf, mix, multiply, replace, screen, tint, walk
 
 
@@ -90,12 +90,15 @@ class Anatomy:
     """The albedos of the base."""
     forms: tuple[str, ...]
     """The grey factors of the base."""
+    edges: int
+    """Paints that lie over the whole."""
 
     @staticmethod
     def of(root: Node) -> Anatomy:
         """Find the parts of a tree; any tree has a canvas and a base, perhaps the root itself."""
-        address, node = root.kind, root
+        address, node, edges = root.kind, root, 0
         while isinstance(node, Operator) and node.kind == "mix" and not is_paint(node) and is_paint(node.children[0]):
+            edges += 1
             address, node = f"{address}.1.{node.children[1].kind}", node.children[1]
         canvas = address
         if isinstance(node, Operator) and node.kind == "screen":
@@ -112,7 +115,7 @@ class Anatomy:
             if leaf.kind == "albedo"
         )
         forms = tuple(where for where, part in factors if not is_paint(part)) if len(factors) > 1 else ()
-        return Anatomy(canvas, base, paints, forms)
+        return Anatomy(canvas, base, paints, forms, edges)
 
 
 def complement(mask: Leaf) -> Leaf | None:
@@ -143,13 +146,13 @@ class Proposer:
         parts = Anatomy.of(root)
         found: list[Move] = []
         for family in families:
-            if family.endswith(("lights", "spots", "environments")):
+            if family.endswith(("lights", "rims", "spots", "environments")):
                 found += self._lights(root, known[parts.canvas], residual, family, grey_only=family.startswith("plain"))
                 if family in ("lights", "spots"):
                     for where in parts.forms[:1]:
                         found += self._lights(root, known[where], residual, family, grey_only=True)
             elif family in ("masks", "plain_masks"):
-                for where in dict.fromkeys(((root.kind,) if family == "masks" else ()) + parts.paints):
+                for where in dict.fromkeys(((root.kind,) if family == "masks" and parts.edges < 2 else ()) + parts.paints):
                     found += self._paints(root, known[where], residual, family)
             else:
                 found += self._shades(root, known[parts.base], residual, family)
@@ -268,6 +271,7 @@ def swaps(root: Node) -> list[Node]:
         if pair and scale:
             grey = sum(pair[0]["color"]) / 3.0
             found.append(replace(root, address, pair[1].set(**{scale: min(grey, 1.0)})))
+        found += _as_shade(root, address, node)
         if not isinstance(node, Leaf):
             continue
         for other in _relatives(node):
@@ -280,14 +284,41 @@ def swaps(root: Node) -> list[Node]:
     return found
 
 
+def _as_shade(root: Node, address: str, node: Node) -> list[Node]:
+    """What a soft mask or a spot does to the base, done by two-tone shading instead."""
+    found = []
+    if isinstance(node, Operator) and node.kind == "mix" and node.mask and is_paint(node):
+        for mask in [node.mask] if node.mask.kind == "threshold" else _relatives(node.mask):
+            bright, dark = sorted(node.children, key=lambda paint: -_brightness(paint))
+            edge = mask if bright is node.children[0] else complement(mask) or mask
+            softness = min(max(edge["softness"][0], 0.05), 4.0)
+            ambient = min(_brightness(dark) / max(_brightness(bright), 1e-3), 1.0)
+            found.append((replace(root, address, bright), edge["direction"], edge["threshold"][0] - 0.5 * softness, softness, ambient))
+    elif isinstance(node, Leaf) and node.kind == "toon_highlight" and address.rsplit(".", 2)[0] in Anatomy.of(root).forms:
+        edge = math.cos(min(node["radius"][0], math.pi)) - 0.05
+        found.append((replace(root, address, None), node["direction"], edge, 0.1, 0.5))
+    shaded = []
+    for kept, direction, start, softness, ambient in found:
+        base = Anatomy.of(kept).base
+        shade = leaf("toon_diffuse", direction=direction, ambient=ambient, threshold=min(max(start, -3.5), 1.0), softness=softness)
+        shaded.append(replace(kept, base, add_shade(find(kept, base), shade)))
+    return shaded
+
+
+def _brightness(paint: Node) -> float:
+    """Mean of the channels of a paint's colours."""
+    colors = [node["color"] for _, node in walk(paint) if isinstance(node, Leaf) and node.kind == "albedo"]
+    return sum(sum(color) for color in colors) / max(3 * len(colors), 1)
+
+
 def _relatives(node: Leaf) -> list[Leaf]:
     """The same light, form or mask as the kinds next to it."""
     direction = node["direction"] if node.kind not in ("albedo", "image", "image_mask", "environment_map") else None
     match node.kind:
         case "highlight":
             sharpness, amplitude = node["sharpness"][0], node["amplitude"][0]
-            radius = min(0.8 / math.sqrt(sharpness), 1.5)
-            return [leaf("toon_highlight", direction=direction, radius=radius, brightness=min(amplitude, 1.0), softness=min(radius, 2.0))]
+            radius = min(1.2 / math.sqrt(sharpness), 1.5)
+            return [leaf("toon_highlight", direction=direction, radius=radius, brightness=min(0.65 * amplitude, 1.0), softness=0.3 * radius)]
         case "toon_highlight":
             sharpness = min(max(0.7 / max(node["radius"][0], 0.01) ** 2, 0.1), 2000.0)
             return [leaf("highlight", direction=direction, sharpness=sharpness, amplitude=node["brightness"][0])]
@@ -296,8 +327,12 @@ def _relatives(node: Leaf) -> list[Leaf]:
         case "toon_diffuse":
             return [leaf("diffuse", direction=direction, ambient=node["ambient"][0])]
         case "stripe":
-            edge = node["center"][0] - 0.5 * node["width"][0]
-            return [leaf("threshold", direction=direction, threshold=edge, softness=node["softness"][0])]
+            low, high = (node["center"][0] + side * 0.5 * node["width"][0] for side in (-1.0, 1.0))
+            softness = node["softness"][0]
+            return [
+                leaf("threshold", direction=direction, threshold=low, softness=softness),
+                leaf("threshold", direction=[-part for part in direction], threshold=-high, softness=softness),
+            ]
         case "threshold":
             edge = node["threshold"][0]
             if abs(edge) >= 0.9:

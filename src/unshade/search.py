@@ -18,23 +18,30 @@ import torch
 
 from unshade.atoms import Dictionary
 from unshade.fit.fitted import Fitted
-from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, Model, fit_pixels, sharpen
+from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
+from unshade.fit.model import NO_LIMITS, Limits, Model, soften
 from unshade.fit.pixels import Pixels
 from unshade.moves import Move, Proposer, removals, swaps
 from unshade.nodes import Leaf, Node, count_values, leaf
 
-PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots")
+PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots", "plain_rims")
 """The families of the released grammar: all lights grey, edges drawn."""
+PLAIN_LIMITS: Limits = {"softness": (0.0, 0.15), "sharpness": (20.0, 150.0), "exponent": (0.7, 1.5), "radius": (0.0, 0.8)}
+"""Its ranges, a little wider, so that a fit does not turn a spot into something else."""
+
 DRAWN = 1.0e-5
 """A plain tree with a mean squared error under this one is the answer: the picture was drawn with such a tree."""
 
 LARGEST_DRAWN = 48
 """Values of the largest tree of the released grammar, about."""
 
+SETTLED = 3.0e-4
+"""Only a plain tree under this error is worth settling leaf by leaf."""
+
 PHOTOGRAPHIC = 1.0e-3
 """A plain tree over this error is given up: the picture was not drawn with one."""
 
-FLOOR = 2.0e-6
+FLOOR = 5.0e-6
 """Mean squared error that is not worth lowering: rounding to 8 bits alone makes 1.3e-6."""
 
 
@@ -57,6 +64,8 @@ class Effort:
     """Times that all leaves are offered other kinds."""
     sweep_steps: int = 12
     """Most changes a sweep makes."""
+    settle_steps: int = 14
+    """Most changes that a plain tree is offered one by one."""
     polish_steps: int = 25
 
 
@@ -112,7 +121,7 @@ class Search:
         self,
         samples: Samples,
         effort: Effort,
-        families: tuple[str, ...] = ("lights", "masks", "shades", "spots", "environments"),
+        families: tuple[str, ...] = ("lights", "rims", "masks", "shades", "spots", "environments"),
         skip: int = 0,
     ) -> None:
         self.samples, self.effort, self.families, self.skip = samples, effort, families, skip
@@ -180,52 +189,84 @@ class Search:
             leader = min(states, key=self._drawn)
             best, stale = (leader, 0) if self._drawn(leader) < self._drawn(best) else (best, stale + 1)
             yield "plain", best
-        sharp = self._sharpen(best)
+        sharp = self._sharpen(best, PLAIN_LIMITS)
         if sharp.error > PHOTOGRAPHIC:
             return sharp
-        for _ in range(2):
-            before = sharp
-            for sharp in self._grow(
-                self._fit(sharp.root, self.samples.points, effort.growth_steps),
-                self.samples.points,
-                self.samples.points_dictionary,
-                FLOOR,
-                PLAIN,
-            ):
-                yield "plain", sharp
-            sharp = self._sharpen(self._sweep(self._sharpen(sharp), self.samples.fine))
+        points, dictionary = self.samples.points, self.samples.points_dictionary
+        for grown in self._grow(self._fit(sharp.root, points, effort.growth_steps, limits=PLAIN_LIMITS), points, dictionary, FLOOR, PLAIN, PLAIN_LIMITS):
+            sharp = grown
             yield "plain", sharp
-            if sharp.error < DRAWN or sharp.error > 0.7 * before.error:
+        sharp = self._sharpen(sharp, PLAIN_LIMITS)
+        for _ in range(effort.settle_steps if sharp.error < SETTLED else 0):
+            better = self._settle(sharp)
+            if better is None:
                 break
+            sharp = better
+            yield "settle", sharp
         return sharp
+
+    def _settle(self, current: Candidate) -> Candidate | None:
+        """A plain tree with one leaf less, of another kind or in another place, if that is better once its edges are hard."""
+        points = self.samples.points
+        base = soften(current.root, FINE_SOFTNESS)
+        better = self._sharpest(current, [base, *removals(base), *swaps(base)])
+        if better is not None or current.error < FLOOR:
+            return better
+        proposer = Proposer(self.samples.points_dictionary, points.target, points.weight)
+        moved = []
+        for smaller in [base, *removals(base)]:
+            fitted = fit_pixels(points, smaller, steps=3, softest=FINE_SOFTNESS, limits=PLAIN_LIMITS).root
+            model = Model(fitted, points)
+            moved += [move.root for move in proposer.propose(model, model.layout.pack(fitted), PLAIN, 2)]
+        return self._sharpest(current, moved)
+
+    def _sharpest(self, current: Candidate, roots: list[Node]) -> Candidate | None:
+        """The best of some trees by a short soft fit, then a sharp one of the most promising; None if none is better."""
+        points = self.samples.points
+        start = fit_pixels(points, soften(current.root, FINE_SOFTNESS), steps=4, softest=FINE_SOFTNESS, limits=PLAIN_LIMITS).error
+        options = []
+        for root in roots:
+            if count_values(root) <= self.effort.max_values:
+                quick = fit_pixels(points, root, steps=4, softest=FINE_SOFTNESS, limits=PLAIN_LIMITS)
+                options.append(Candidate(quick.root, quick.error))
+        options.sort(key=settled)
+        smaller = [option for option in options if option.values < current.values and option.error < 1.5 * start + 1e-5]
+        options = smaller[:6] + [option for option in options if option not in smaller][:6]
+        best, bar = None, settled(current) - 2e-3
+        for option in options:
+            fitted = sharpen(self.samples.fine, option.root, steps=12, limits=PLAIN_LIMITS)
+            found = Candidate(fitted.root, fitted.error)
+            if settled(found) < bar:
+                best, bar = found, settled(found)
+        return best
 
     def _drawn(self, candidate: Candidate) -> float:
         """How a plain tree is judged while it grows: a dearer price than `judge`'s keeps small trees in the beam."""
         return math.log(candidate.error + FLOOR) + 5.0 * self.effort.price * candidate.values
 
     def _coarse(self, root: Node, steps: int) -> Candidate:
-        fitted = fit_pixels(self.samples.coarse, root, steps=steps, tolerance=1e-3, softest=COARSE_SOFTNESS)
+        fitted = fit_pixels(self.samples.coarse, root, steps=steps, tolerance=1e-3, softest=COARSE_SOFTNESS, limits=PLAIN_LIMITS)
         candidate = Candidate(fitted.root, fitted.error)
         self.rough.add(candidate)
         return candidate
 
     def _forms(self, proposer: Proposer) -> list[Candidate]:
-        """Where plain trees start: one colour, alone and under one or two shadings."""
+        """Where plain trees start: one colour, alone and under one or two shadings or rims."""
         flat = self._coarse(self._start(), 2)
         found = layer = [flat]
         for _ in range(2):
             options: list[Candidate] = []
             for state in layer:
                 model = Model(state.root, self.samples.coarse)
-                moves = proposer.propose(model, model.layout.pack(state.root), ("plain_shades",), 6)
+                moves = proposer.propose(model, model.layout.pack(state.root), ("plain_shades", "plain_rims"), 8)
                 options += [self._coarse(move.root, 10) for move in moves]
-            layer = distinct(sorted(options, key=lambda option: option.error), 6, each=3)
+            layer = distinct(sorted(options, key=lambda option: option.error), 8, each=3)
             found = found + layer
         return found
 
-    def _sharpen(self, current: Candidate) -> Candidate:
+    def _sharpen(self, current: Candidate, limits: Limits = NO_LIMITS) -> Candidate:
         """Fit on the fine points, edges about a pixel wide, then hard where that is better."""
-        fitted = sharpen(self.samples.fine, current.root, steps=self.effort.polish_steps)
+        fitted = sharpen(self.samples.fine, current.root, steps=self.effort.polish_steps, limits=limits)
         return Candidate(fitted.root, fitted.error)
 
     def _start(self) -> Node:
@@ -233,16 +274,16 @@ class Search:
         mean = (pixels.target * pixels.weight).sum(1).clamp(0.0, 1.0)
         return leaf("albedo", color=mean.tolist())
 
-    def _fit(self, root: Node, pixels: Pixels, steps: int, tolerance: float = 1e-3) -> Candidate:
+    def _fit(self, root: Node, pixels: Pixels, steps: int, tolerance: float = 1e-3, limits: Limits = NO_LIMITS) -> Candidate:
         fitted: Fitted = fit_pixels(
-            pixels, root, steps=steps, tolerance=tolerance, softest=FINE_SOFTNESS if pixels is not self.samples.coarse else COARSE_SOFTNESS
+            pixels, root, steps=steps, tolerance=tolerance, softest=FINE_SOFTNESS if pixels is not self.samples.coarse else COARSE_SOFTNESS, limits=limits
         )
         candidate = Candidate(fitted.root, fitted.error)
         (self.rough if pixels is self.samples.coarse else self.front).add(candidate)
         return candidate
 
     def _grow(
-        self, current: Candidate, pixels: Pixels, dictionary: Dictionary, stop: float, families: tuple[str, ...] | None = None
+        self, current: Candidate, pixels: Pixels, dictionary: Dictionary, stop: float, families: tuple[str, ...] | None = None, limits: Limits = NO_LIMITS
     ) -> Iterator[Candidate]:
         """Add the leaf that pays most, again and again."""
         proposer = Proposer(dictionary, pixels.target, pixels.weight)
@@ -257,22 +298,22 @@ class Search:
             if self.skip:
                 moves = moves[self.skip :] or moves
                 self.skip = 0
-            grown = self._try(moves, pixels, proposer.error)
+            grown = self._try(moves, pixels, proposer.error, limits)
             if grown is None:
                 return
             current = grown
             yield current
 
-    def _try(self, moves: list[Move], pixels: Pixels, error: float) -> Candidate | None:
+    def _try(self, moves: list[Move], pixels: Pixels, error: float, limits: Limits) -> Candidate | None:
         """Short fits of the most promising moves; a full one of the best, if it pays."""
         for first in range(0, len(moves), self.effort.trials):
             best = (0.0, moves[0].root)
             for move in moves[first : first + self.effort.trials]:
-                fitted = fit_pixels(pixels, move.root, steps=self.effort.trial_steps, softest=FINE_SOFTNESS)
+                fitted = fit_pixels(pixels, move.root, steps=self.effort.trial_steps, softest=FINE_SOFTNESS, limits=limits)
                 pays = math.log((error + FLOOR) / (fitted.error + FLOOR)) / max(move.cost, 1)
                 best = max(best, (pays, fitted.root), key=lambda option: option[0])
             if best[0] >= self.effort.price:
-                return self._fit(best[1], pixels, self.effort.growth_steps)
+                return self._fit(best[1], pixels, self.effort.growth_steps, limits=limits)
         return None
 
     def _sweep(self, current: Candidate, pixels: Pixels) -> Candidate:
@@ -306,6 +347,11 @@ class Search:
         smaller = self._fit(options[min(number, len(options) - 1)][1], pixels, self.effort.growth_steps)
         *_, regrown = [smaller, *self._grow(smaller, pixels, self.samples.points_dictionary, FLOOR)]
         return regrown
+
+
+def settled(candidate: Candidate) -> float:
+    """How a nearly right drawn tree is judged: a leaf that shows lowers this by 1 or more, one that mends a few pixels does not."""
+    return math.log(candidate.error + 3.0e-5) + 0.03 * candidate.values
 
 
 def distinct(candidates: list[Candidate], most: int, each: int = 1) -> list[Candidate]:
