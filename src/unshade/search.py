@@ -35,7 +35,7 @@ DRAWN = 1.0e-5
 LARGEST_DRAWN = 48
 """Values of the largest tree of the released grammar, about."""
 
-SETTLED = 3.0e-4
+SETTLED = 2.0e-4
 """Only a plain tree under this error is worth settling leaf by leaf."""
 
 PHOTOGRAPHIC = 1.0e-3
@@ -52,17 +52,17 @@ class Effort:
     max_values: int
     price: float = 0.006
     """Least decrease of log(error) that a stored value must bring."""
-    beam: int = 5
-    beam_moves: int = 6
+    beam: int = 4
+    beam_moves: int = 5
     trials: int = 4
     """Moves that are tried by a short fit at each growth."""
     trial_steps: int = 5
     growth_steps: int = 12
-    rounds: int = 2
+    rounds: int = 0
     """Times that the least useful leaf is taken out and the tree grown again."""
     sweeps: int = 1
     """Times that all leaves are offered other kinds."""
-    sweep_steps: int = 12
+    sweep_steps: int = 2
     """Most changes a sweep makes."""
     settle_steps: int = 14
     """Most changes that a plain tree is offered one by one."""
@@ -182,7 +182,7 @@ class Search:
             for state in states:
                 model = Model(state.root, pixels)
                 moves = proposer.propose(model, model.layout.pack(state.root), PLAIN, effort.beam_moves)
-                options += [self._coarse(move.root, effort.trial_steps) for move in moves if move.cost <= min(effort.max_values, LARGEST_DRAWN) - state.values]
+                options += [self._coarse(move.root, 4) for move in moves if move.cost <= min(effort.max_values, LARGEST_DRAWN) - state.values]
             states = [self._coarse(option.root, 8) for option in distinct(sorted(options, key=self._drawn), effort.beam, each=2)]
             if not states:
                 break
@@ -196,8 +196,12 @@ class Search:
         for grown in self._grow(self._fit(sharp.root, points, effort.growth_steps, limits=PLAIN_LIMITS), points, dictionary, FLOOR, PLAIN, PLAIN_LIMITS):
             sharp = grown
             yield "plain", sharp
+            if sharp.values >= LARGEST_DRAWN:
+                break
         sharp = self._sharpen(sharp, PLAIN_LIMITS)
-        for _ in range(effort.settle_steps if sharp.error < SETTLED else 0):
+        for step in range(effort.settle_steps):
+            if sharp.error > (SETTLED if step < 2 else 0.25 * SETTLED):
+                break
             better = self._settle(sharp)
             if better is None:
                 break
@@ -258,9 +262,9 @@ class Search:
             options: list[Candidate] = []
             for state in layer:
                 model = Model(state.root, self.samples.coarse)
-                moves = proposer.propose(model, model.layout.pack(state.root), ("plain_shades", "plain_rims"), 8)
-                options += [self._coarse(move.root, 10) for move in moves]
-            layer = distinct(sorted(options, key=lambda option: option.error), 8, each=3)
+                moves = proposer.propose(model, model.layout.pack(state.root), ("plain_shades", "plain_rims"), 6)
+                options += [self._coarse(move.root, 8) for move in moves]
+            layer = distinct(sorted(options, key=lambda option: option.error), 5, each=2)
             found = found + layer
         return found
 
