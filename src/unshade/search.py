@@ -35,7 +35,7 @@ DRAWN = 1.0e-5
 LARGEST_DRAWN = 48
 """Values of the largest tree of the released grammar, about."""
 
-SETTLED = 2.0e-4
+SETTLED = 3.0e-4
 """Only a plain tree under this error is worth settling leaf by leaf."""
 
 PHOTOGRAPHIC = 1.0e-3
@@ -52,8 +52,8 @@ class Effort:
     max_values: int
     price: float = 0.006
     """Least decrease of log(error) that a stored value must bring."""
-    beam: int = 4
-    beam_moves: int = 5
+    beam: int = 5
+    beam_moves: int = 6
     trials: int = 4
     """Moves that are tried by a short fit at each growth."""
     trial_steps: int = 5
@@ -62,7 +62,7 @@ class Effort:
     """Times that the least useful leaf is taken out and the tree grown again."""
     sweeps: int = 1
     """Times that all leaves are offered other kinds."""
-    sweep_steps: int = 2
+    sweep_steps: int = 1
     """Most changes a sweep makes."""
     settle_steps: int = 14
     """Most changes that a plain tree is offered one by one."""
@@ -146,15 +146,15 @@ class Search:
     def run(self) -> Iterator[tuple[str, Candidate]]:
         """(stage, candidate) as they come; the last one is the result."""
         with torch.no_grad():
-            plain: Candidate | None = None
-            if self.effort.beam and not self.skip:
-                plain = yield from self._plain()
-                if plain.error < DRAWN:
-                    yield "polish", plain
-                    return
             current = Candidate(self._start(), math.inf)
             for current in self._grow(current, self.samples.coarse, self.samples.coarse_dictionary, stop=1e-4):
                 yield "grow", current
+            plain: Candidate | None = None
+            if self.effort.beam and not self.skip:
+                plain = yield from self._plain(self.rough.members())
+                if plain is not None and plain.error < DRAWN:
+                    yield "polish", plain
+                    return
             current = self._fit(current.root, self.samples.points, self.effort.growth_steps)
             for current in self._grow(current, self.samples.points, self.samples.points_dictionary, stop=FLOOR):
                 yield "grow", current
@@ -171,8 +171,11 @@ class Search:
                 current = plain
             yield "polish", current
 
-    def _plain(self) -> Generator[tuple[str, Candidate], None, Candidate]:
-        """Beam search with only the words of the released grammar, which a drawn or sampled picture may be made of."""
+    def _plain(self, curve: list[Candidate]) -> Generator[tuple[str, Candidate], None, Candidate | None]:
+        """Beam search with only the words of the released grammar, which a drawn or sampled picture may be made of.
+
+        ``curve`` is what all words reach. A photograph shows itself by the plain words falling behind; then None.
+        """
         effort, pixels = self.effort, self.samples.coarse
         proposer = Proposer(self.samples.coarse_dictionary, pixels.target, pixels.weight)
         states = self._forms(proposer)
@@ -189,6 +192,10 @@ class Search:
             leader = min(states, key=self._drawn)
             best, stale = (leader, 0) if self._drawn(leader) < self._drawn(best) else (best, stale + 1)
             yield "plain", best
+            rivals = [candidate.error for candidate in curve if candidate.values <= leader.values]
+            lost = leader.values >= 16 and min(leader.error, best.error) > 3.0 * min(rivals, default=math.inf)
+            if lost or leader.values >= 26 and min(leader.error, best.error) > 1.2 * min(rivals, default=math.inf) and best.error > 2.5e-4:
+                return None
         sharp = self._sharpen(best, PLAIN_LIMITS)
         if sharp.error > PHOTOGRAPHIC:
             return sharp
@@ -200,7 +207,7 @@ class Search:
                 break
         sharp = self._sharpen(sharp, PLAIN_LIMITS)
         for step in range(effort.settle_steps):
-            if sharp.error > (SETTLED if step < 2 else 0.25 * SETTLED):
+            if sharp.error > (SETTLED if step < 5 else 0.25 * SETTLED):
                 break
             better = self._settle(sharp)
             if better is None:
@@ -264,9 +271,9 @@ class Search:
                 model = Model(state.root, self.samples.coarse)
                 moves = proposer.propose(model, model.layout.pack(state.root), ("plain_shades", "plain_rims"), 6)
                 options += [self._coarse(move.root, 8) for move in moves]
-            layer = distinct(sorted(options, key=lambda option: option.error), 5, each=2)
+            layer = distinct(sorted(options, key=lambda option: option.error), 6, each=3)
             found = found + layer
-        return found
+        return distinct(sorted(found, key=self._drawn), 8)
 
     def _sharpen(self, current: Candidate, limits: Limits = NO_LIMITS) -> Candidate:
         """Fit on the fine points, edges about a pixel wide, then hard where that is better."""
