@@ -63,7 +63,7 @@ def recolored(base: Node, scale: list[float]) -> Node:
     """The base with its paints scaled a channel, inside their range."""
     for address, node in walk(base):
         if isinstance(node, Leaf) and node.kind == "albedo":
-            base = replace(base, address, node.set(color=[min(max(c * s, 0.0), 1.0) for c, s in zip(node["color"], scale, strict=True)]))  # type: ignore[arg-type]
+            base = replace(base, address, node.set(color=[min(max(c * s, 0.0), 1.0) for c, s in zip(node["color"], scale, strict=True)]))
     return base
 
 
@@ -295,8 +295,8 @@ def _as_shade(root: Node, address: str, node: Node) -> list[Node]:
             ambient = min(_brightness(dark) / max(_brightness(bright), 1e-3), 1.0)
             found.append((replace(root, address, bright), edge["direction"], edge["threshold"][0] - 0.5 * softness, softness, ambient))
     elif isinstance(node, Leaf) and node.kind == "toon_highlight" and address.rsplit(".", 2)[0] in Anatomy.of(root).forms:
-        edge = math.cos(min(node["radius"][0], math.pi)) - 0.05
-        found.append((replace(root, address, None), node["direction"], edge, 0.1, 0.5))
+        start = math.cos(min(node["radius"][0], math.pi)) - 0.05
+        found.append((replace(root, address, None), node["direction"], start, 0.1, 0.5))
     shaded = []
     for kept, direction, start, softness, ambient in found:
         base = Anatomy.of(kept).base
@@ -313,12 +313,14 @@ def _brightness(paint: Node) -> float:
 
 def _relatives(node: Leaf) -> list[Leaf]:
     """The same light, form or mask as the kinds next to it."""
-    direction = node["direction"] if node.kind not in ("albedo", "image", "image_mask", "environment_map") else None
+    direction: tuple[float, ...] = () if node.kind in ("albedo", "image", "image_mask", "environment_map") else node["direction"]
     match node.kind:
         case "highlight":
             sharpness, amplitude = node["sharpness"][0], node["amplitude"][0]
             radius = min(1.2 / math.sqrt(sharpness), 1.5)
-            return [leaf("toon_highlight", direction=direction, radius=radius, brightness=min(0.65 * amplitude, 1.0), softness=0.3 * radius)]
+            return [
+                leaf("toon_highlight", direction=direction, radius=radius, brightness=min(0.65 * amplitude, 1.0), softness=0.3 * radius)
+            ]
         case "toon_highlight":
             sharpness = min(max(0.7 / max(node["radius"][0], 0.01) ** 2, 0.1), 2000.0)
             return [leaf("highlight", direction=direction, sharpness=sharpness, amplitude=node["brightness"][0])]

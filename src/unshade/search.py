@@ -32,10 +32,10 @@ PLAIN_LIMITS: Limits = {"softness": (0.0, 0.15), "sharpness": (20.0, 150.0), "ex
 DRAWN = 1.0e-5
 """A plain tree with a mean squared error under this one is the answer: the picture was drawn with such a tree."""
 
-LARGEST_DRAWN = 48
-"""Values of the largest tree of the released grammar, about."""
+LARGEST_DRAWN = 56
+"""Values of the largest tree of the released grammar, and one detour more."""
 
-SETTLED = 3.0e-4
+SETTLED = 5.0e-4
 """Only a plain tree under this error is worth settling leaf by leaf."""
 
 PHOTOGRAPHIC = 1.0e-3
@@ -62,7 +62,7 @@ class Effort:
     """Times that the least useful leaf is taken out and the tree grown again."""
     sweeps: int = 1
     """Times that all leaves are offered other kinds."""
-    sweep_steps: int = 1
+    sweep_steps: int = 2
     """Most changes a sweep makes."""
     settle_steps: int = 14
     """Most changes that a plain tree is offered one by one."""
@@ -185,7 +185,9 @@ class Search:
             for state in states:
                 model = Model(state.root, pixels)
                 moves = proposer.propose(model, model.layout.pack(state.root), PLAIN, effort.beam_moves)
-                options += [self._coarse(move.root, 4) for move in moves if move.cost <= min(effort.max_values, LARGEST_DRAWN) - state.values]
+                options += [
+                    self._coarse(move.root, 4) for move in moves if move.cost <= min(effort.max_values, LARGEST_DRAWN) - state.values
+                ]
             states = [self._coarse(option.root, 8) for option in distinct(sorted(options, key=self._drawn), effort.beam, each=2)]
             if not states:
                 break
@@ -193,21 +195,23 @@ class Search:
             best, stale = (leader, 0) if self._drawn(leader) < self._drawn(best) else (best, stale + 1)
             yield "plain", best
             rivals = [candidate.error for candidate in curve if candidate.values <= leader.values]
-            lost = leader.values >= 16 and min(leader.error, best.error) > 3.0 * min(rivals, default=math.inf)
-            if lost or leader.values >= 26 and min(leader.error, best.error) > 1.2 * min(rivals, default=math.inf) and best.error > 2.5e-4:
+            behind = min(leader.error, best.error) / min(rivals, default=math.inf)
+            if best.error > 2.5e-4 and behind > (3.0 if leader.values < 26 else 1.2) and leader.values >= 16:
                 return None
         sharp = self._sharpen(best, PLAIN_LIMITS)
         if sharp.error > PHOTOGRAPHIC:
             return sharp
         points, dictionary = self.samples.points, self.samples.points_dictionary
-        for grown in self._grow(self._fit(sharp.root, points, effort.growth_steps, limits=PLAIN_LIMITS), points, dictionary, FLOOR, PLAIN, PLAIN_LIMITS):
+        for grown in self._grow(
+            self._fit(sharp.root, points, effort.growth_steps, limits=PLAIN_LIMITS), points, dictionary, FLOOR, PLAIN, PLAIN_LIMITS
+        ):
             sharp = grown
             yield "plain", sharp
             if sharp.values >= LARGEST_DRAWN:
                 break
         sharp = self._sharpen(sharp, PLAIN_LIMITS)
         for step in range(effort.settle_steps):
-            if sharp.error > (SETTLED if step < 5 else 0.25 * SETTLED):
+            if sharp.error > (SETTLED if step < 5 else 0.15 * SETTLED):
                 break
             better = self._settle(sharp)
             if better is None:
@@ -287,14 +291,25 @@ class Search:
 
     def _fit(self, root: Node, pixels: Pixels, steps: int, tolerance: float = 1e-3, limits: Limits = NO_LIMITS) -> Candidate:
         fitted: Fitted = fit_pixels(
-            pixels, root, steps=steps, tolerance=tolerance, softest=FINE_SOFTNESS if pixels is not self.samples.coarse else COARSE_SOFTNESS, limits=limits
+            pixels,
+            root,
+            steps=steps,
+            tolerance=tolerance,
+            softest=FINE_SOFTNESS if pixels is not self.samples.coarse else COARSE_SOFTNESS,
+            limits=limits,
         )
         candidate = Candidate(fitted.root, fitted.error)
         (self.rough if pixels is self.samples.coarse else self.front).add(candidate)
         return candidate
 
     def _grow(
-        self, current: Candidate, pixels: Pixels, dictionary: Dictionary, stop: float, families: tuple[str, ...] | None = None, limits: Limits = NO_LIMITS
+        self,
+        current: Candidate,
+        pixels: Pixels,
+        dictionary: Dictionary,
+        stop: float,
+        families: tuple[str, ...] | None = None,
+        limits: Limits = NO_LIMITS,
     ) -> Iterator[Candidate]:
         """Add the leaf that pays most, again and again."""
         proposer = Proposer(dictionary, pixels.target, pixels.weight)

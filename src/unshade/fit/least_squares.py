@@ -90,7 +90,14 @@ def minimise(
 
 
 def fit_pixels(
-    pixels: Pixels, root: Node, *, locked: Collection[str] = (), steps: int = 30, tolerance: float = 1e-4, softest: float = 0.0, limits: Limits = NO_LIMITS
+    pixels: Pixels,
+    root: Node,
+    *,
+    locked: Collection[str] = (),
+    steps: int = 30,
+    tolerance: float = 1e-4,
+    softest: float = 0.0,
+    limits: Limits = NO_LIMITS,
 ) -> Fitted:
     """Fit the parameters of a structure at given pixels, from the tree's own numbers."""
     with torch.no_grad():
@@ -106,7 +113,11 @@ def sharpen(pixels: Pixels, root: Node, *, locked: Collection[str] = (), steps: 
     fitted = fit_pixels(pixels, soften(root, FINE_SOFTNESS), locked=locked, steps=steps, softest=FINE_SOFTNESS, limits=limits)
     root, error = fitted.root, fitted.error
     for address, node in walk(fitted.root):
-        if isinstance(node, Leaf) and any(p.name == "softness" for p in KINDS[node.kind].parameters) and node["softness"][0] < 2.0 * FINE_SOFTNESS:  # type: ignore[operator]
+        if (
+            isinstance(node, Leaf)
+            and any(p.name == "softness" for p in KINDS[node.kind].parameters)
+            and node["softness"][0] < 2.0 * FINE_SOFTNESS
+        ):
             hard = replace(root, address, node.set(softness=0.0))
             hard_error = error_of(pixels, hard)
             if hard_error < error:

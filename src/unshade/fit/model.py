@@ -123,7 +123,12 @@ class Model:
     def _columns(self, limits: Limits) -> None:
         """What each row of the Jacobian moves, and its bounds."""
         layout = self.layout
-        flat = [(layout.slots[k][p].start + offset, tangent) for group in self.groups for k in group.leaves for p, offset, tangent in group.pattern]
+        flat = [
+            (layout.slots[k][p].start + offset, tangent)
+            for group in self.groups
+            for k in group.leaves
+            for p, offset, tangent in group.pattern
+        ]
         self.number = torch.tensor([number for number, _ in flat], dtype=torch.long)
         self.plain = torch.tensor([tangent < 0 for _, tangent in flat], dtype=torch.bool)
         self.log = layout.logarithmic[self.number] & self.plain
@@ -232,7 +237,9 @@ class Model:
         basis = torch.zeros(vector.shape[0], 2, 3, dtype=vector.dtype)
         if len(self.directions):
             direction = F.normalize(vector[self.spread], dim=-1)
-            helper = torch.where(direction[:, 2:].abs() < 0.9, direction.new_tensor([[0.0, 0.0, 1.0]]), direction.new_tensor([[1.0, 0.0, 0.0]]))
+            helper = torch.where(
+                direction[:, 2:].abs() < 0.9, direction.new_tensor([[0.0, 0.0, 1.0]]), direction.new_tensor([[1.0, 0.0, 0.0]])
+            )
             first = F.normalize(torch.linalg.cross(helper, direction), dim=-1)
             basis[self.directions] = torch.stack([first, torch.linalg.cross(direction, first)], dim=1)
         return basis
@@ -249,10 +256,10 @@ class Model:
 
     def _environment(self, group: _Group, numbers: torch.Tensor, values: list[torch.Tensor], basis: torch.Tensor) -> torch.Tensor:
         """Derivatives of an environment by its own free columns, (columns, 3, N)."""
-        arguments = [argument[0] for argument in self._arguments(group, numbers)]
+        direction, sharpness, color = (argument[0] for argument in self._arguments(group, numbers))
         value = values[group.leaves[0]]
         mirrored = reflect(self.normals)[:, 0]
-        turned, sharpened, lobe = environment(mirrored, value, *arguments, basis[group.index[0][0, ::3]])
+        turned, sharpened, lobe = environment(mirrored, value, direction, sharpness, color, basis[group.index[0][0, ::3]])
         columns = torch.zeros(len(group.pattern), 3, mirrored.shape[1], dtype=mirrored.dtype)
         for column, (p, offset, tangent) in enumerate(group.pattern):
             if tangent >= 0:
