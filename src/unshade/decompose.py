@@ -16,11 +16,12 @@ from unshade.atoms import Dictionary
 from unshade.errors import PictureError, TreeError, did_you_mean
 from unshade.fit.least_squares import COARSE_SIZE, fit_least_squares
 from unshade.fit.pixels import Pixels
+from unshade.growth import Candidate, Effort, Samples, outline
 from unshade.metrics import psnr
 from unshade.nodes import Family, Member, Node, Tree, count_values, find_address
 from unshade.pictures import SphereImage, read_sphere, sphere_from_array
 from unshade.render import render
-from unshade.search import Candidate, Effort, Samples, Search, outline
+from unshade.search import Search
 from unshade.sphere import sphere_normals
 
 POINTS = 2500

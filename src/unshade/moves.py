@@ -271,7 +271,7 @@ def swaps(root: Node) -> list[Node]:
         if pair and scale:
             grey = sum(pair[0]["color"]) / 3.0
             found.append(replace(root, address, pair[1].set(**{scale: min(grey, 1.0)})))
-        found += _as_shade(root, address, node)
+        found += _as_shade(root, address, node) + _as_stripe(root, address, node)
         if not isinstance(node, Leaf):
             continue
         for other in _relatives(node):
@@ -303,6 +303,33 @@ def _as_shade(root: Node, address: str, node: Node) -> list[Node]:
         shade = leaf("toon_diffuse", direction=direction, ambient=ambient, threshold=min(max(start, -3.5), 1.0), softness=softness)
         shaded.append(replace(kept, base, add_shade(find(kept, base), shade)))
     return shaded
+
+
+def _as_stripe(root: Node, address: str, node: Node) -> list[Node]:
+    """Two parallel edges with the same paint outside them as one band."""
+    if not (isinstance(node, Operator) and node.mask and node.mask.kind == "threshold"):
+        return []
+    found = []
+    for outer, inner in enumerate(node.children):
+        if not (isinstance(inner, Operator) and inner.mask and inner.mask.kind == "threshold" and is_paint(node.children[1 - outer])):
+            continue
+        direction = node.mask["direction"]
+        along = sum(a * b for a, b in zip(direction, inner.mask["direction"], strict=True))
+        if abs(along) < 0.9:
+            continue
+        for shown, paint in enumerate(inner.children):
+            # where the inner child is seen, and where this child of it is, as bounds on n.l
+            bounds = [
+                (outer == 0, node.mask["threshold"][0]),
+                ((shown == 0) == (along > 0), math.copysign(1.0, along) * inner.mask["threshold"][0]),
+            ]
+            low = [edge for above, edge in bounds if above]
+            high = [edge for above, edge in bounds if not above]
+            if len(low) == 1 and high[0] > low[0]:
+                center, width = min(max(0.5 * (low[0] + high[0]), -1.0), 1.0), min(high[0] - low[0], 2.0)
+                band = leaf("stripe", direction=direction, center=center, width=width, softness=node.mask["softness"][0])
+                found.append(replace(root, address, mix(paint, inner.children[1 - shown], band)))
+    return found
 
 
 def _brightness(paint: Node) -> float:

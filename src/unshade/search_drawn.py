@@ -1,0 +1,180 @@
+"""Search for the tree that a picture was drawn with: beam search with only the words of the released grammar.
+
+Toon pictures, vector art and sampled trees are made of few exact parts. Their tree is found by trying every form of
+shading side by side, then settling it leaf by leaf with its edges hard, down to the rounding of the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+
+from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
+from unshade.fit.model import Limits, Model, soften
+from unshade.growth import FLOOR, Candidate, Growth
+from unshade.moves import Anatomy, Proposer, removals, swaps
+from unshade.nodes import Node, count_values, find
+
+PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots", "plain_rims")
+"""The families of the released grammar: all lights grey, edges drawn."""
+PLAIN_LIMITS: Limits = {"softness": (0.0, 0.15), "sharpness": (20.0, 150.0), "exponent": (0.7, 1.5), "radius": (0.0, 0.8)}
+"""Its ranges, a little wider, so that a fit does not turn a spot into something else."""
+
+DRAWN = 1.0e-5
+"""A plain tree with a mean squared error under this one is the answer: the picture was drawn with such a tree."""
+
+LARGEST_DRAWN = 56
+"""Values of the largest tree of the released grammar, and one detour more."""
+
+SETTLED = 5.0e-4
+"""Only a plain tree under this error is worth settling leaf by leaf."""
+
+PHOTOGRAPHIC = 1.0e-3
+"""A plain tree over this error is given up: the picture was not drawn with one."""
+
+
+class DrawnSearch(Growth):
+    """`run` yields better and better candidates and returns the best, or None where the picture was not drawn."""
+
+    def run(self, curve: list[Candidate]) -> Generator[tuple[str, Candidate], None, Candidate | None]:
+        """Beam search with only the words of the released grammar, which a drawn or sampled picture may be made of.
+
+        ``curve`` is what all words reach. A photograph shows itself by the plain words falling behind; then None.
+        """
+        effort, pixels = self.effort, self.samples.coarse
+        proposer = Proposer(self.samples.coarse_dictionary, pixels.target, pixels.weight)
+        states = self._forms(proposer)
+        best, stale = min(states, key=self._drawn), 0
+        while stale < 2:
+            options = self._extended(states, proposer, PLAIN, effort.beam_moves, 4)
+            states = [self._coarse(option.root, 8) for option in lineages(sorted(options, key=self._drawn), effort.beam)]
+            if not states:
+                break
+            leader = min(states, key=self._drawn)
+            best, stale = (leader, 0) if self._drawn(leader) < self._drawn(best) else (best, stale + 1)
+            yield "plain", best
+            rivals = [candidate.error for candidate in curve if candidate.values <= leader.values]
+            behind = min(leader.error, best.error) / min(rivals, default=math.inf)
+            if best.error > 2.5e-4 and behind > (3.0 if leader.values < 26 else 1.5) and leader.values >= 16:
+                return None
+        sharp = self.sharpen(best, PLAIN_LIMITS)
+        if sharp.error > PHOTOGRAPHIC:
+            return sharp
+        points, dictionary = self.samples.points, self.samples.points_dictionary
+        for grown in self.grow(
+            self.fit(sharp.root, points, effort.growth_steps, limits=PLAIN_LIMITS), points, dictionary, FLOOR, PLAIN, PLAIN_LIMITS
+        ):
+            sharp = grown
+            yield "plain", sharp
+            if sharp.values >= LARGEST_DRAWN:
+                break
+        sharp = self.sharpen(sharp, PLAIN_LIMITS)
+        for step in range(effort.settle_steps):
+            if sharp.error > (SETTLED if step < 5 else 0.15 * SETTLED):
+                break
+            better = self._settle(sharp)
+            if better is None:
+                break
+            sharp = better
+            yield "settle", sharp
+        return sharp
+
+    def prune(self, current: Candidate, most: int) -> Candidate:
+        """A tree that reproduces a drawn picture, without what is only there to mend a few pixels."""
+        for _ in range(most):
+            base = soften(current.root, FINE_SOFTNESS)
+            better = self._sharpest(current, [base, *removals(base), *swaps(base)])
+            if better is None or better.error > DRAWN:
+                break
+            current = better
+        return current
+
+    def _settle(self, current: Candidate) -> Candidate | None:
+        """A plain tree with one leaf less, of another kind or in another place, if that is better once its edges are hard."""
+        points = self.samples.points
+        base = soften(current.root, FINE_SOFTNESS)
+        better = self._sharpest(current, [base, *removals(base), *swaps(base)])
+        if better is not None or current.error < FLOOR:
+            return better
+        proposer = Proposer(self.samples.points_dictionary, points.target, points.weight)
+        moved = []
+        for smaller in [base, *removals(base)]:
+            fitted = fit_pixels(points, smaller, steps=3, softest=FINE_SOFTNESS, limits=PLAIN_LIMITS).root
+            model = Model(fitted, points)
+            moved += [move.root for move in proposer.propose(model, model.layout.pack(fitted), PLAIN, 2)]
+        return self._sharpest(current, moved)
+
+    def _sharpest(self, current: Candidate, roots: list[Node]) -> Candidate | None:
+        """The best of some trees by a short soft fit, then a sharp one of the most promising; None if none is better."""
+        points = self.samples.points
+        start = fit_pixels(points, soften(current.root, FINE_SOFTNESS), steps=4, softest=FINE_SOFTNESS, limits=PLAIN_LIMITS).error
+        options = []
+        for root in roots:
+            if count_values(root) <= self.effort.max_values:
+                quick = fit_pixels(points, root, steps=4, softest=FINE_SOFTNESS, limits=PLAIN_LIMITS)
+                options.append(Candidate(quick.root, quick.error))
+        options.sort(key=settled)
+        smaller = [option for option in options if option.values < current.values and option.error < 1.5 * start + 1e-5]
+        options = smaller[:6] + [option for option in options if option not in smaller][:6]
+        best, bar = None, settled(current) - 2e-3
+        for option in options:
+            fitted = sharpen(self.samples.fine, option.root, steps=12, limits=PLAIN_LIMITS)
+            found = Candidate(fitted.root, fitted.error)
+            if settled(found) < bar:
+                best, bar = found, settled(found)
+        return best
+
+    def _drawn(self, candidate: Candidate) -> float:
+        """How a plain tree is judged while it grows: a dearer price than `judge`'s keeps small trees in the beam."""
+        return math.log(candidate.error + FLOOR) + 5.0 * self.effort.price * candidate.values
+
+    def _coarse(self, root: Node, steps: int) -> Candidate:
+        fitted = fit_pixels(self.samples.coarse, root, steps=steps, tolerance=1e-3, softest=COARSE_SOFTNESS, limits=PLAIN_LIMITS)
+        candidate = Candidate(fitted.root, fitted.error)
+        self.rough.add(candidate)
+        return candidate
+
+    def _forms(self, proposer: Proposer) -> list[Candidate]:
+        """Where plain trees start: one colour, alone, under a shading or two, and with a rim."""
+        found = layer = [self._coarse(self.start(), 2)]
+        for _ in range(2):
+            layer = self._extended(layer, proposer, ("plain_shades", "plain_rims"), 6, 8)
+            layer = lineages(sorted(layer, key=lambda option: option.error), 3)
+            found = found + layer
+        return lineages(sorted(found, key=self._drawn), 2)
+
+    def _extended(self, states: list[Candidate], proposer: Proposer, families: tuple[str, ...], most: int, steps: int) -> list[Candidate]:
+        """Every state with one leaf more, by short fits; only forms that the released grammar has."""
+        options = []
+        for state in states:
+            model = Model(state.root, self.samples.coarse)
+            for move in proposer.propose(model, model.layout.pack(state.root), families, most):
+                if move.cost <= min(self.effort.max_values, LARGEST_DRAWN) - state.values and form_of(move.root) in RELEASED_FORMS:
+                    options.append(self._coarse(move.root, steps))
+        return options
+
+
+def settled(candidate: Candidate) -> float:
+    """How a nearly right drawn tree is judged: a leaf that shows lowers this by 1 or more, one that mends a few pixels does not."""
+    return math.log(max(candidate.error, 6.0e-6) + 3.0e-5) + 0.03 * candidate.values
+
+
+RELEASED_FORMS = {(), ("diffuse",), ("toon_diffuse",), ("toon_diffuse", "toon_diffuse")}
+"""Shadings of a base in the released grammar; one toon shading alone is on the way to two."""
+
+
+def form_of(root: Node) -> tuple[str, ...]:
+    """The kinds of a base's shadings."""
+    return tuple(find(root, address).kind for address in Anatomy.of(root).forms)
+
+
+def lineages(candidates: list[Candidate], each: int) -> list[Candidate]:
+    """The first candidates of every form, so that a wrong shading that fits well early cannot crowd out the right one."""
+    seen: dict[tuple[str, ...], int] = {}
+    chosen = []
+    for candidate in candidates:
+        key = form_of(candidate.root)
+        seen[key] = seen.get(key, 0) + 1
+        if seen[key] <= each:
+            chosen.append(candidate)
+    return chosen
