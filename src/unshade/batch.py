@@ -44,6 +44,7 @@ class Settings:
     seed: int = 0
     alternatives: int = 1
     search: Literal["size", "depth"] = "size"
+    objective: Literal["l2", "paper"] = "l2"
     disc: tuple[float, float, float] | None = None
     mask: str | None = None
     artifacts: str = "all"
@@ -219,6 +220,7 @@ def _decompose_picture(job: Job, on_step: Callable[[Step], None] | None) -> Reco
         seed=settings.seed,
         alternatives=settings.alternatives,
         search=settings.search,
+        objective=settings.objective,
     )
     for step in decomposition:
         if on_step:

@@ -113,6 +113,13 @@ def cli(context: click.Context) -> None:
     show_default=True,
     help="Grow by size, or level by level as the paper.",
 )
+@click.option(
+    "--objective",
+    type=click.Choice(["l2", "paper"]),
+    default="l2",
+    show_default=True,
+    help="Of --search depth: pixels alone, or the paper's L2 plus VGG features, a hundred times slower; needs the perceptual extra.",
+)
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes for several pictures; all cores when not given.")
 @click.option("--resume/--force", default=True, help="Skip pictures that are done with the same settings (the default), or do them again.")
 @output_options

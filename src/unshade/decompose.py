@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -79,6 +80,17 @@ class Result:
     preset: str
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sums depend on how many threads share them; one thread gives the same bits everywhere, and small sums run faster."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 class Decomposition(Iterator[Step]):
     """The work on one picture. Iterate for improving trees, or ask for the `result` at once.
 
@@ -97,7 +109,8 @@ class Decomposition(Iterator[Step]):
     def __next__(self) -> Step:
         if self._cancelled or self._result is not None:
             raise StopIteration
-        found = next(self._work)
+        with _one_thread():
+            found = next(self._work)
         if isinstance(found, Result):
             self._result = found
             raise StopIteration
@@ -128,6 +141,7 @@ def decompose(
     seed: int = 0,
     alternatives: int = 1,
     search: Literal["size", "depth"] = "size",
+    objective: Literal["l2", "paper"] = "l2",
 ) -> Decomposition:
     """Decompose a picture of a shaded sphere into a shade tree.
 
@@ -139,8 +153,10 @@ def decompose(
         alternatives: how many structurally different trees of about one size are wanted, the chosen one among them.
         search: ``size`` grows trees leaf by leaf; ``depth`` is the paper's second stage, structures in order of depth
             fitted by BasinCMA, and takes minutes.
+        objective: of ``depth``: ``l2`` compares pixels, ``paper`` pixels and VGG features, a hundred times slower.
     Raises:
-        PictureError: the picture cannot be used. TreeError: an argument is out of range.
+        PictureError: the picture cannot be used. TreeError: an argument is out of range. MissingExtraError: the
+            ``paper`` objective without its weights.
     """
     if preset not in PRESETS:
         raise TreeError(f"unknown preset {preset!r}{did_you_mean(preset, PRESETS)}")
@@ -150,12 +166,20 @@ def decompose(
         raise TreeError(f"alternatives must be at least 1, got {alternatives}")
     if search not in ("size", "depth"):
         raise TreeError(f"search must be size or depth, got {search!r}")
+    if objective not in ("l2", "paper"):
+        raise TreeError(f"objective must be l2 or paper, got {objective!r}")
+    if objective == "paper" and search != "depth":
+        raise TreeError("the paper's objective belongs to search='depth'; the search by size compares pixels")
+    if objective == "paper":
+        from unshade.models import perceptual
+
+        perceptual.weight_file()
     sphere = _sphere(image)
     chosen = PRESETS[preset]
     if max_values is not None:
         chosen = dataclasses.replace(chosen, effort=dataclasses.replace(chosen.effort, max_values=max_values))
     if search == "depth":
-        return Decomposition(_by_depth(sphere, chosen, seed))
+        return Decomposition(_by_depth(sphere, chosen, seed, objective))
     return Decomposition(_by_size(sphere, chosen, seed, alternatives))
 
 
@@ -167,7 +191,8 @@ def fit(image: SphereImage | torch.Tensor | Any | str | Path, tree: Tree, *, loc
     """
     sphere = _sphere(image)
     held = {_locked_address(tree.root, where) for where in locked}
-    fitted = fit_least_squares(sphere.image, sphere.valid, tree.root, seed=seed, locked=held)
+    with _one_thread():
+        fitted = fit_least_squares(sphere.image, sphere.valid, tree.root, seed=seed, locked=held)
     found = dataclasses.replace(tree, root=fitted.root, exposure=sphere.exposure)
     start, member = _member(sphere, tree.root), Member(found, _psnr(sphere, fitted.root))
     if start.psnr > member.psnr:
@@ -274,7 +299,7 @@ def _alternatives(sphere: SphereImage, chosen: Member, candidates: list[Candidat
     return others
 
 
-def _by_depth(sphere: SphereImage, preset: Preset, seed: int) -> Iterator[Step | Result]:
+def _by_depth(sphere: SphereImage, preset: Preset, seed: int, objective: Literal["l2", "paper"]) -> Iterator[Step | Result]:
     """The paper's second stage: structures in order of depth, BasinCMA, then the whole tree."""
     from unshade import search_depth
     from unshade.fit.basin_cma import fit_basin_cma
@@ -285,11 +310,11 @@ def _by_depth(sphere: SphereImage, preset: Preset, seed: int) -> Iterator[Step |
     for progress in search_depth.search(
         sphere.image,
         sphere.valid,
-        partial(fit_basin_cma, objective="l2", meta_steps=6, gradient_steps=10, final_steps=150),
+        partial(fit_basin_cma, objective=objective, meta_steps=6, gradient_steps=10, final_steps=150),
         0.01,
         seed=seed,
         rank=partial(fit_gradient, size=20, steps=50, restarts=3),
-        whole_tree=partial(fit_gradient, restarts=1),
+        whole_tree=partial(fit_gradient, restarts=1, objective=objective),
         max_values=preset.max_values,
     ):
         member = _member(sphere, progress.root)
