@@ -29,6 +29,9 @@ LARGEST_DRAWN = 56
 SETTLED = 5.0e-4
 """Only a plain tree under this error is worth settling leaf by leaf."""
 
+HOPELESS = 4.0
+"""A form whose trees have this many times the error of the best is left behind."""
+
 PHOTOGRAPHIC = 1.0e-3
 """A plain tree over this error is given up: the picture was not drawn with one."""
 
@@ -55,7 +58,7 @@ class DrawnSearch(Growth):
             yield "plain", best
             rivals = [candidate.error for candidate in curve if candidate.values <= leader.values]
             behind = min(leader.error, best.error) / min(rivals, default=math.inf)
-            if best.error > 2.5e-4 and behind > (3.0 if leader.values < 26 else 1.5) and leader.values >= 16:
+            if best.error > 2.5e-4 and behind > (1.8 if leader.values < 26 else 1.4) and leader.values >= 16:
                 return None
         sharp = self.sharpen(best, PLAIN_LIMITS)
         if sharp.error > PHOTOGRAPHIC:
@@ -73,7 +76,7 @@ class DrawnSearch(Growth):
             if sharp.error > (SETTLED if step < 5 else 0.15 * SETTLED):
                 break
             better = self._settle(sharp)
-            if better is None:
+            if better is None or better.error > max(DRAWN, 1.3 * sharp.error):
                 break
             sharp = better
             yield "settle", sharp
@@ -169,12 +172,16 @@ def form_of(root: Node) -> tuple[str, ...]:
 
 
 def lineages(candidates: list[Candidate], each: int) -> list[Candidate]:
-    """The first candidates of every form, so that a wrong shading that fits well early cannot crowd out the right one."""
+    """The first candidates of every form, so that a wrong shading that fits well early cannot crowd out the right one.
+
+    A form that is `HOPELESS` times worse than the best is left behind.
+    """
+    bar = HOPELESS * min((candidate.error for candidate in candidates), default=0.0)
     seen: dict[tuple[str, ...], int] = {}
     chosen = []
     for candidate in candidates:
         key = form_of(candidate.root)
         seen[key] = seen.get(key, 0) + 1
-        if seen[key] <= each:
+        if seen[key] <= each and candidate.error <= bar:
             chosen.append(candidate)
     return chosen
