@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -17,12 +18,12 @@ from unshade.atoms import Dictionary
 from unshade.errors import PictureError, TreeError, did_you_mean
 from unshade.fit.least_squares import COARSE_SIZE, fit_least_squares
 from unshade.fit.pixels import Pixels
-from unshade.growth import Candidate, Effort, Samples, outline
+from unshade.growth import Effort, Samples, outline
 from unshade.metrics import psnr
-from unshade.nodes import Family, Member, Node, Tree, count_values, find_address
+from unshade.nodes import Family, Member, Node, Tree, find_address
 from unshade.pictures import SphereImage, read_sphere, sphere_from_array
-from unshade.render import render
-from unshade.search import Search
+from unshade.render import render, srgb_decode
+from unshade.search import ALL, Search
 from unshade.sphere import sphere_normals
 
 POINTS = 2500
@@ -59,7 +60,8 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class Step:
-    """An improving tree. ``done`` of ``total`` says how far the work is; ``psnr`` in dB is estimated until the end."""
+    """A tree on the way. Trees improve within a stage; ``done`` of ``total`` says how far the work is, and ``psnr`` in dB is
+    measured on some of the pixels until the end. `Decomposition` remembers the best."""
 
     tree: Tree
     psnr: float
@@ -100,9 +102,9 @@ class Decomposition(Iterator[Step]):
     1
     """
 
-    def __init__(self, work: Iterator[Step | Result]) -> None:
-        self._work = work
-        self._last: Step | None = None
+    def __init__(self, work: Iterator[Step | Result], sphere: SphereImage, seed: int, preset: str) -> None:
+        self._work, self._sphere, self._seed, self._preset = work, sphere, seed, preset
+        self._best: Step | None = None
         self._result: Result | None = None
         self._cancelled = False
 
@@ -114,7 +116,8 @@ class Decomposition(Iterator[Step]):
         if isinstance(found, Result):
             self._result = found
             raise StopIteration
-        self._last = found
+        if self._best is None or found.psnr > self._best.psnr:
+            self._best = found
         return found
 
     def cancel(self) -> None:
@@ -127,10 +130,10 @@ class Decomposition(Iterator[Step]):
             pass
         if self._result is not None:
             return self._result
-        if self._last is None:
+        if self._best is None:
             raise TreeError("the decomposition was cancelled before its first step")
-        member = Member(self._last.tree, self._last.psnr)
-        return Result(member.tree, Family((member,), 0), member.psnr, -1, "cancelled")
+        member = Member(self._best.tree, _psnr(self._sphere, self._best.tree))
+        return Result(member.tree, Family((member,), 0), member.psnr, self._seed, self._preset)
 
 
 def decompose(
@@ -179,8 +182,8 @@ def decompose(
     if max_values is not None:
         chosen = dataclasses.replace(chosen, effort=dataclasses.replace(chosen.effort, max_values=max_values))
     if search == "depth":
-        return Decomposition(_by_depth(sphere, chosen, seed, objective))
-    return Decomposition(_by_size(sphere, chosen, seed, alternatives))
+        return Decomposition(_by_depth(sphere, chosen, seed, objective), sphere, seed, preset)
+    return Decomposition(_by_size(sphere, chosen, seed, alternatives), sphere, seed, preset)
 
 
 def fit(image: SphereImage | torch.Tensor | Any | str | Path, tree: Tree, *, locked: Collection[str] = (), seed: int = 0) -> Result:
@@ -191,12 +194,11 @@ def fit(image: SphereImage | torch.Tensor | Any | str | Path, tree: Tree, *, loc
     """
     sphere = _sphere(image)
     held = {_locked_address(tree.root, where) for where in locked}
+    target = srgb_decode(sphere.image) if tree.blend_space == "linear" else sphere.image
     with _one_thread():
-        fitted = fit_least_squares(sphere.image, sphere.valid, tree.root, seed=seed, locked=held)
-    found = dataclasses.replace(tree, root=fitted.root, exposure=sphere.exposure)
-    start, member = _member(sphere, tree.root), Member(found, _psnr(sphere, fitted.root))
-    if start.psnr > member.psnr:
-        member = Member(dataclasses.replace(tree, exposure=sphere.exposure), start.psnr)
+        fitted = fit_least_squares(target, sphere.valid, tree.root, seed=seed, locked=held)
+    trees = [dataclasses.replace(tree, root=root, exposure=sphere.exposure) for root in (fitted.root, tree.root)]
+    member = max((Member(found, _psnr(sphere, found)) for found in trees), key=lambda found: found.psnr)
     return Result(member.tree, Family((member,), 0), member.psnr, seed, "fit")
 
 
@@ -266,37 +268,39 @@ def _samples(sphere: SphereImage, preset: Preset, seed: int) -> Samples:
 
 def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int) -> Iterator[Step | Result]:
     samples = _samples(sphere, preset, seed)
-    total = preset.effort.max_values * alternatives
+    share = preset.effort.max_values
+    total = share * alternatives
+    main = Search(samples, preset.effort)
     done = 0
-    searches = []
-    for number in range(alternatives):
-        search = Search(samples, preset.effort, skip=number)
-        found: Candidate | None = None
-        for stage, found in search.run():
-            done = min(max(done, number * preset.effort.max_values + found.values), total - 1)
-            yield Step(Tree(found.root, exposure=sphere.exposure), _decibels(found.error), found.values, stage, done, total)
-        assert found is not None
-        searches.append((search, found))
-    search, found = searches[0]
+    for stage, found in main.run():
+        done = min(max(done, found.values // 2 if stage in ("grow", "plain") else 3 * found.values // 4), share - 1)
+        yield Step(Tree(found.root, exposure=sphere.exposure), _decibels(found.error), found.values, stage, done, total)
     chosen = _member(sphere, found.root)
-    members = [member for member in search.family(preset.members) if count_values(member.root) < chosen.values]
-    curve = [_member(sphere, member.root) for member in members]
-    curve = [member for k, member in enumerate(curve) if member.psnr < chosen.psnr and all(member.psnr > other.psnr for other in curve[:k])]
-    others = _alternatives(sphere, chosen, [candidate for _, candidate in searches[1:]])
+    others: list[Member] = []
+    for left_out in _left_out() if alternatives > 1 else ():
+        done = share * (1 + len(others))
+        for _, found in Search(samples, preset.effort, left_out).run():
+            yield Step(chosen.tree, chosen.psnr, chosen.values, "alternatives", min(done + found.values // 2, total - 1), total)
+        if outline(found.root) not in {outline(member.tree.root) for member in (chosen, *others)}:
+            others.append(_member(sphere, found.root))
+        if len(others) == alternatives - 1:
+            break
+    curve: list[Member] = []
+    for candidate in main.family(preset.members):
+        member = _member(sphere, candidate.root)
+        if member.values < chosen.values and (curve[-1].psnr if curve else -math.inf) < member.psnr < chosen.psnr:
+            curve.append(member)
     family = Family((*curve, chosen), len(curve), tuple(others))
     yield Step(chosen.tree, chosen.psnr, chosen.values, "done", total, total)
     yield Result(chosen.tree, family, chosen.psnr, seed, preset.name)
 
 
-def _alternatives(sphere: SphereImage, chosen: Member, candidates: list[Candidate]) -> list[Member]:
-    """Those of other structure than the chosen tree and than one another."""
-    seen = {outline(chosen.tree.root)}
-    others = []
-    for candidate in candidates:
-        if outline(candidate.root) not in seen:
-            seen.add(outline(candidate.root))
-            others.append(_member(sphere, candidate.root))
-    return others
+def _left_out() -> Iterator[frozenset[str]]:
+    """Families of leaves to do without: a picture explained without masks, without two-tone shading, ... is explained otherwise."""
+    for count in range(1, len(ALL) - 2):
+        yield from map(
+            frozenset, itertools.combinations(sorted(ALL, key=("masks", "shades", "lights", "spots", "rims", "environments").index), count)
+        )
 
 
 def _by_depth(sphere: SphereImage, preset: Preset, seed: int, objective: Literal["l2", "paper"]) -> Iterator[Step | Result]:

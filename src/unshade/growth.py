@@ -158,9 +158,8 @@ class Growth:
         stop: float,
         families: tuple[str, ...],
         limits: Limits = NO_LIMITS,
-        skip: int = 0,
     ) -> Iterator[Candidate]:
-        """Add the leaf that pays most, again and again. ``skip`` passes over the best moves of the first step."""
+        """Add the leaf that pays most, again and again."""
         proposer = Proposer(dictionary, pixels.target, pixels.weight)
         effort = self.effort
         while True:
@@ -170,7 +169,6 @@ class Growth:
             moves = [move for move in moves if move.cost <= room and move.relative > 0.0]
             if proposer.error <= stop or not moves:
                 return
-            moves, skip = moves[skip:] or moves, 0
             grown = self._try(moves, pixels, proposer.error, limits)
             if grown is None:
                 return

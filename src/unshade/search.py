@@ -21,21 +21,21 @@ ALL = ("lights", "rims", "masks", "shades", "spots", "environments")
 class Search(Growth):
     """One search. `run` yields better and better candidates; the last one is the result.
 
-    ``skip`` passes over the best moves of the first growth, which leads to another explanation of the picture.
+    ``left_out`` are families of leaves to do without, which leads to another explanation of the picture.
     """
 
-    def __init__(self, samples: Samples, effort: Effort, skip: int = 0) -> None:
+    def __init__(self, samples: Samples, effort: Effort, left_out: frozenset[str] = frozenset()) -> None:
         super().__init__(samples, effort)
-        self.skip = skip
+        self.families = tuple(family for family in ALL if family not in left_out)
 
     def run(self) -> Iterator[tuple[str, Candidate]]:
         """(stage, candidate) as they come; the last one is the result."""
         with torch.no_grad():
             current = Candidate(self.start(), math.inf)
-            for current in self.grow(current, self.samples.coarse, self.samples.coarse_dictionary, 1e-4, ALL, skip=self.skip):
+            for current in self.grow(current, self.samples.coarse, self.samples.coarse_dictionary, 1e-4, self.families):
                 yield "grow", current
             plain: Candidate | None = None
-            if self.effort.beam and not self.skip:
+            if self.effort.beam and self.families == ALL:
                 drawn = DrawnSearch(self.samples, self.effort)
                 plain = yield from drawn.run(self.rough.members())
                 self.front.update(drawn.front)
@@ -44,7 +44,7 @@ class Search(Growth):
                     yield "polish", plain
                     return
             current = self.fit(current.root, self.samples.points, self.effort.growth_steps)
-            for current in self.grow(current, self.samples.points, self.samples.points_dictionary, FLOOR, ALL):
+            for current in self.grow(current, self.samples.points, self.samples.points_dictionary, FLOOR, self.families):
                 yield "grow", current
             for _ in range(self.effort.sweeps):
                 current = self._sweep(current, self.samples.points)
@@ -55,7 +55,7 @@ class Search(Growth):
                     current = better
                     yield "exchange", current
             current = self.sharpen(current)
-            if self.effort.beam and current.error < DRAWN:
+            if self.effort.beam and self.families == ALL and current.error < DRAWN:
                 current = DrawnSearch(self.samples, self.effort).prune(current, 6)
             if plain and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
                 current = plain
@@ -90,5 +90,5 @@ class Search(Growth):
         if not options:
             return current
         smaller = self.fit(options[min(number, len(options) - 1)][1], pixels, self.effort.growth_steps)
-        *_, regrown = [smaller, *self.grow(smaller, pixels, self.samples.points_dictionary, FLOOR, ALL)]
+        *_, regrown = [smaller, *self.grow(smaller, pixels, self.samples.points_dictionary, FLOOR, self.families)]
         return regrown

@@ -12,7 +12,7 @@ from collections.abc import Collection
 import torch
 
 from unshade.fit.fitted import Fitted
-from unshade.fit.model import EDGE, NO_LIMITS, Limits, Model, is_hard, soften
+from unshade.fit.model import EDGE, NO_LIMITS, Limits, Model, is_hard, is_locked, soften
 from unshade.fit.pixels import Pixels
 from unshade.nodes import KINDS, Leaf, Node, replace, walk
 from unshade.types import Image, Mask
@@ -110,26 +110,27 @@ def fit_pixels(
 
 def sharpen(pixels: Pixels, root: Node, *, locked: Collection[str] = (), steps: int = 30, limits: Limits = NO_LIMITS) -> Fitted:
     """Fit with edges about a pixel wide, then make hard every edge that is better hard."""
-    fitted = fit_pixels(pixels, soften(root, FINE_SOFTNESS), locked=locked, steps=steps, softest=FINE_SOFTNESS, limits=limits)
+    fitted = fit_pixels(pixels, soften(root, FINE_SOFTNESS, locked), locked=locked, steps=steps, softest=FINE_SOFTNESS, limits=limits)
     root, error = fitted.root, fitted.error
     for address, node in walk(fitted.root):
         if (
             isinstance(node, Leaf)
             and any(p.name == "softness" for p in KINDS[node.kind].parameters)
             and node["softness"][0] < 2.0 * FINE_SOFTNESS
+            and not is_locked(address, "softness", locked)
         ):
             hard = replace(root, address, node.set(softness=0.0))
             hard_error = error_of(pixels, hard)
             if hard_error < error:
                 root, error = hard, hard_error
     if root is not fitted.root:
-        root = place_edges(pixels, root)
+        root = place_edges(pixels, root, locked)
         again = fit_pixels(pixels, root, locked=locked, steps=steps // 2, limits=limits)
         root, error = again.root, again.error
     return Fitted(root, error, fitted.history)
 
 
-def place_edges(pixels: Pixels, root: Node, rounds: int = 6, tries: int = 64) -> Node:
+def place_edges(pixels: Pixels, root: Node, locked: Collection[str] = (), rounds: int = 6, tries: int = 64) -> Node:
     """Move hard edges by fractions of a pixel where that is better, by seeded random search, one edge at a time.
 
     The error of a hard edge is a staircase that no gradient descends; but the picture is affine in the leaf, so a whole
@@ -151,7 +152,7 @@ def place_edges(pixels: Pixels, root: Node, rounds: int = 6, tries: int = 64) ->
                 size = 0.004 * 0.5**number
                 tried = [
                     stored + size * torch.randn(tries, len(stored), generator=generator, dtype=torch.float64)
-                    if parameter.name in EDGE and parameter.name != "softness"
+                    if parameter.name in EDGE and parameter.name != "softness" and not is_locked(address, parameter.name, locked)
                     else stored.expand(tries, -1)
                     for parameter, stored in zip(kind.parameters, held, strict=True)
                 ]
@@ -188,6 +189,6 @@ def fit_least_squares(
         The tree and its mean squared error on the points.
     """
     if target.shape[-1] > COARSE_SIZE:
-        root = soften(root, COARSE_SOFTNESS)
+        root = soften(root, COARSE_SOFTNESS, locked)
         root = fit_pixels(Pixels.of(target, mask, COARSE_SIZE), root, locked=locked, steps=steps, softest=COARSE_SOFTNESS).root
     return sharpen(Pixels.important(target, mask, count, seed), root, locked=locked, steps=steps)

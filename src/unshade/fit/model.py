@@ -36,10 +36,15 @@ def is_hard(leaf: Leaf) -> bool:
     return any(parameter.name == "softness" for parameter in KINDS[leaf.kind].parameters) and leaf["softness"] == (0.0,)
 
 
-def soften(root: Node, softness: float) -> Node:
-    """The tree with every hard edge made this wide."""
+def is_locked(address: str, parameter: str, locked: Collection[str]) -> bool:
+    """True where a leaf, a subtree above it or this parameter of it is to keep its numbers."""
+    return any(address == where or address.startswith(f"{where}.") or where == f"{address}.{parameter}" for where in locked)
+
+
+def soften(root: Node, softness: float, locked: Collection[str] = ()) -> Node:
+    """The tree with every hard edge made this wide, locked ones aside."""
     for address, node in walk(root):
-        if isinstance(node, Leaf) and is_hard(node):
+        if isinstance(node, Leaf) and is_hard(node) and not is_locked(address, "softness", locked):
             root = replace(root, address, node.set(softness=softness))
     return root
 
@@ -90,12 +95,10 @@ class Model:
     def _pattern(self, k: int, locked: frozenset[str]) -> tuple[tuple[int, int, int], ...]:
         """The free columns of one leaf: two a direction, one for any other number that is not held."""
         address, leaf = self.addresses[k], self.leaves[k]
-        if any(address == where or address.startswith(where + ".") for where in locked):
-            return ()
         hard = is_hard(leaf)
         own: list[tuple[int, int, int]] = []
         for p, (parameter, slot) in enumerate(zip(KINDS[leaf.kind].parameters, self.layout.slots[k], strict=True)):
-            if f"{address}.{parameter.name}" in locked or (hard and parameter.name in EDGE):
+            if is_locked(address, parameter.name, locked) or (hard and parameter.name in EDGE):
                 continue
             if parameter.type == "direction":
                 own += [(p, offset, tangent) for offset in range(0, slot.stop - slot.start, 3) for tangent in (0, 1)]
@@ -280,7 +283,21 @@ class Model:
                 flat[:, offset : offset + 3] = basis[group.index[p][:, offset], tangent]
             else:
                 flat[:, offset] = 1.0
+        if any(isinstance(stored, Raster) for stored in self.leaves[group.leaves[0]].values):
+            return self._differences(group.kind, arguments, tangents).transpose(0, 1)
         return forward_mode(group.kind, self.normals, arguments, tangents).transpose(0, 1)
+
+    def _differences(self, kind: str, arguments: list[torch.Tensor], tangents: list[torch.Tensor]) -> torch.Tensor:
+        """Central differences, for look-ups in pictures, which PyTorch does not differentiate forwards; (D, K, C, N)."""
+        step = 1e-6 if self.normals.dtype is torch.float64 else 1e-3
+        sides = []
+        for side in (step, -step):
+            shaded = [
+                KINDS[kind].formula(self.normals, *(a + side * t[d] for a, t in zip(arguments, tangents, strict=True)))
+                for d in range(len(tangents[0]))
+            ]
+            sides.append(torch.stack(shaded)[..., 0, :])
+        return (sides[0] - sides[1]) / (2.0 * step)
 
     def move(self, vector: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """The vector after a step in the free coordinates, inside its bounds."""
