@@ -41,8 +41,8 @@ class Role(enum.Enum):
     MASK = "mask"
 
 
-BROAD_SHARPNESS = 6.0
-"""The one border between broad and sharp: a highlight with a smaller sharpness (half-width over about 20 degrees) is form, hence
+BROAD_SHARPNESS = 4.0
+"""The one border between broad and sharp: a highlight with a smaller sharpness (half-width over about 24 degrees) is form, hence
 part of the diffuse; a sharper one is a light's reflection."""
 
 

@@ -14,8 +14,11 @@ from unshade.moves import removals, swaps
 from unshade.nodes import count_values
 from unshade.search_drawn import DRAWN, DrawnSearch
 
-ALL = ("lights", "rims", "masks", "shades", "spots", "environments")
+ALL = ("lights", "masks", "shades", "spots", "rims", "environments")
 """Every family of leaves."""
+
+LATE = frozenset({"rims", "environments"})
+"""Families that come only once a tree is good: early they take over form, which belongs to the diffuse part."""
 
 
 class Search(Growth):
@@ -27,12 +30,13 @@ class Search(Growth):
     def __init__(self, samples: Samples, effort: Effort, left_out: frozenset[str] = frozenset()) -> None:
         super().__init__(samples, effort)
         self.families = tuple(family for family in ALL if family not in left_out)
+        self.early = tuple(family for family in self.families if family not in LATE)
 
     def run(self) -> Iterator[tuple[str, Candidate]]:
         """(stage, candidate) as they come; the last one is the result."""
         with torch.no_grad():
             current = Candidate(self.start(), math.inf)
-            for current in self.grow(current, self.samples.coarse, self.samples.coarse_dictionary, 1e-4, self.families):
+            for current in self.grow(current, self.samples.coarse, self.samples.coarse_dictionary, 1e-4, self.early):
                 yield "grow", current
             plain: Candidate | None = None
             if self.effort.beam and self.families == ALL:
