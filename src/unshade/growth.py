@@ -50,6 +50,8 @@ class Effort:
     settle_steps: int = 14
     """Most changes that a plain tree is offered one by one."""
     polish_steps: int = 25
+    late: bool = False
+    """Also grow rims and environments, which pay only in large trees."""
 
 
 @dataclass(frozen=True)

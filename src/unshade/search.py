@@ -18,7 +18,8 @@ ALL = ("lights", "masks", "shades", "spots", "rims", "environments")
 """Every family of leaves."""
 
 LATE = frozenset({"rims", "environments"})
-"""Families that come only once a tree is good: early they take over form, which belongs to the diffuse part."""
+"""Families that come only where `Effort.late` asks for them, and once a tree is good: early they take over form, which belongs
+to the diffuse part,."""
 
 
 class Search(Growth):
@@ -29,7 +30,9 @@ class Search(Growth):
 
     def __init__(self, samples: Samples, effort: Effort, left_out: frozenset[str] = frozenset()) -> None:
         super().__init__(samples, effort)
-        self.families = tuple(family for family in ALL if family not in left_out)
+        without = left_out if effort.late else left_out | LATE
+        self.complete = not left_out
+        self.families = tuple(family for family in ALL if family not in without)
         self.early = tuple(family for family in self.families if family not in LATE)
 
     def run(self) -> Iterator[tuple[str, Candidate]]:
@@ -39,7 +42,7 @@ class Search(Growth):
             for current in self.grow(current, self.samples.coarse, self.samples.coarse_dictionary, 1e-4, self.early):
                 yield "grow", current
             plain: Candidate | None = None
-            if self.effort.beam and self.families == ALL:
+            if self.effort.beam and self.complete:
                 drawn = DrawnSearch(self.samples, self.effort)
                 plain = yield from drawn.run(self.rough.members())
                 self.front.update(drawn.front)
@@ -59,7 +62,7 @@ class Search(Growth):
                     current = better
                     yield "exchange", current
             current = self.sharpen(current)
-            if self.effort.beam and self.families == ALL and current.error < DRAWN:
+            if self.effort.beam and self.complete and current.error < DRAWN:
                 current = DrawnSearch(self.samples, self.effort).prune(current, 6)
             if plain and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
                 current = plain
