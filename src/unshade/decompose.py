@@ -298,7 +298,7 @@ def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int) 
 def _left_out() -> Iterator[frozenset[str]]:
     """Families of leaves to do without: a picture explained without masks, without two-tone shading, ... is explained otherwise."""
     for count in (1, 2, 3):
-        yield from map(frozenset, itertools.combinations(("masks", "shades", "spots", "lights", "rims", "environments"), count))
+        yield from map(frozenset, itertools.combinations(("masks", "shades", "spots", "lights"), count))
 
 
 def _by_depth(sphere: SphereImage, preset: Preset, seed: int, objective: Literal["l2", "paper"]) -> Iterator[Step | Result]:
