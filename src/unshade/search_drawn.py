@@ -13,7 +13,7 @@ from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels
 from unshade.fit.model import Limits, Model, soften
 from unshade.growth import FLOOR, Candidate, Growth
 from unshade.moves import Anatomy, Proposer, removals, swaps
-from unshade.nodes import Node, count_values, find
+from unshade.nodes import Node, count_values, find, walk
 
 PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots", "plain_rims")
 """The families of the released grammar: all lights grey, edges drawn."""
@@ -32,6 +32,12 @@ SETTLED = 5.0e-4
 HOPELESS = 4.0
 """A form whose trees have this many times the error of the best is left behind."""
 
+UNLIKE = 2.5e-4
+"""A picture that was not drawn shows itself while the plain trees' error is over this one."""
+
+LEAST_DESCENT = 0.05
+"""Fall of log(error) a value, over two leaves, of plain trees on the way to a drawn picture; photographs give less."""
+
 PHOTOGRAPHIC = 1.0e-3
 """A plain tree over this error is given up: the picture was not drawn with one."""
 
@@ -48,6 +54,7 @@ class DrawnSearch(Growth):
         proposer = Proposer(self.samples.coarse_dictionary, pixels.target, pixels.weight)
         states = self._forms(proposer)
         best, stale = min(states, key=self._drawn), 0
+        leaders: list[Candidate] = []
         while stale < 2:
             options = self._extended(states, proposer, PLAIN, effort.beam_moves, 4)
             states = [self._coarse(option.root, 8) for option in lineages(sorted(options, key=self._drawn), effort.beam)]
@@ -56,10 +63,11 @@ class DrawnSearch(Growth):
             leader = min(states, key=self._drawn)
             best, stale = (leader, 0) if self._drawn(leader) < self._drawn(best) else (best, stale + 1)
             yield "plain", best
-            rivals = [candidate.error for candidate in curve if candidate.values <= leader.values]
-            behind = min(leader.error, best.error) / min(rivals, default=math.inf)
-            if best.error > 2.5e-4 and behind > (1.8 if leader.values < 26 else 1.4) and leader.values >= 16:
+            leaders.append(leader)
+            if best.error > UNLIKE and leader.values >= 16 and (self._is_behind(leader, best, curve) or _is_stuck(leaders)):
                 return None
+        if best.error > UNLIKE:
+            return None
         sharp = self.sharpen(best, PLAIN_LIMITS)
         if sharp.error > PHOTOGRAPHIC:
             return sharp
@@ -81,6 +89,10 @@ class DrawnSearch(Growth):
             sharp = better
             yield "settle", sharp
         return sharp
+
+    def _is_behind(self, leader: Candidate, best: Candidate, curve: list[Candidate]) -> bool:
+        rivals = [candidate.error for candidate in curve if candidate.values <= leader.values]
+        return min(leader.error, best.error) > (1.8 if leader.values < 26 else 1.4) * min(rivals, default=math.inf)
 
     def prune(self, current: Candidate, most: int) -> Candidate:
         """A tree that reproduces a drawn picture, without what is only there to mend a few pixels."""
@@ -171,16 +183,24 @@ def form_of(root: Node) -> tuple[str, ...]:
     return tuple(find(root, address).kind for address in Anatomy.of(root).forms)
 
 
+def _is_stuck(leaders: list[Candidate]) -> bool:
+    """Do the last two leaves explain too little? Every part of a drawn picture lowers its error by a good share."""
+    if len(leaders) < 3:
+        return False
+    before, now = leaders[-3], leaders[-1]
+    return math.log(before.error / max(now.error, FLOOR)) < LEAST_DESCENT * (now.values - before.values)
+
+
 def lineages(candidates: list[Candidate], each: int) -> list[Candidate]:
     """The first candidates of every form, so that a wrong shading that fits well early cannot crowd out the right one.
 
     A form that is `HOPELESS` times worse than the best is left behind.
     """
     bar = HOPELESS * min((candidate.error for candidate in candidates), default=0.0)
-    seen: dict[tuple[str, ...], int] = {}
+    seen: dict[tuple[tuple[str, ...], bool], int] = {}
     chosen = []
     for candidate in candidates:
-        key = form_of(candidate.root)
+        key = form_of(candidate.root), any(node.kind == "rim" for _, node in walk(candidate.root))
         seen[key] = seen.get(key, 0) + 1
         if seen[key] <= each and candidate.error <= bar:
             chosen.append(candidate)
