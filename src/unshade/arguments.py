@@ -67,7 +67,7 @@ def read_document(source: str, text_only: bool = False) -> tuple[Tree, Family | 
     """The tree of a TREE argument, and its family where the file has one. Raises TreeError."""
     from unshade import serde
 
-    path = None if text_only or source == "-" else _file(source)
+    path = None if text_only or source == "-" else tree_file(source)
     try:
         if path is not None:
             tree, text = serde.load(path), path.read_text(encoding="utf-8")
@@ -92,7 +92,7 @@ def _named(error: TreeError, source: str) -> TreeError:
     return renamed
 
 
-def _file(source: str) -> Path | None:
+def tree_file(source: str) -> Path | None:
     """The file that a TREE argument names, if it does."""
     # A tree's text may be longer than a file name can be.
     with contextlib.suppress(OSError, ValueError):

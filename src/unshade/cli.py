@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from unshade import __version__, batch
+from unshade import __version__, batch, cli_edit, cli_relight, cli_transfer
 from unshade.arguments import SEED, output_options, read_document, read_tree
 from unshade.errors import TreeError, UnshadeError
 from unshade.staging import check_folder
@@ -405,6 +405,10 @@ def sample(output: Path | None, count: int, style: str, seed: int, size: int) ->
 def bench() -> None:
     """Measure data sets x methods and write the results."""
     raise AssertionError("`Verbs` puts the real command in the place of this one")
+
+
+for _verb in (*cli_edit.VERBS, *cli_relight.VERBS, *cli_transfer.VERBS):
+    cli.add_command(_verb)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -1,0 +1,152 @@
+"""The visual shading editing analogy (Geng et al. 2023, section 4.2): A is to AB as P is to the answer.
+
+AB is A with one component of B. Each component of B is put into A in turn, and what comes nearest to AB is what was done;
+then P gets that component of Q. Only A, B, P and Q are taken apart: AB is looked at, never decomposed, so that its own
+decomposition cannot mislead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+
+from unshade.components import Component
+from unshade.decompose import decompose
+from unshade.errors import PictureError, TreeError
+from unshade.metrics import psnr
+from unshade.nodes import Tree
+from unshade.pictures import SIZE, SphereImage, read_sphere, sphere_from_array
+from unshade.render import render
+from unshade.sphere import disc_mask, sphere_normals
+from unshade.transfer import transfer
+from unshade.types import Image, Mask
+
+Source: TypeAlias = "Tree | SphereImage | torch.Tensor | str | Path"
+
+VISIBLE = 50.0
+"""dB between two pictures from which they count as the same."""
+
+SURE = 3.0
+"""dB by which an explanation must be nearer than the next to be sure of it."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One of the five as a picture, and as a tree where one is needed."""
+
+    image: Image
+    valid: Mask
+    tree: Tree
+
+
+@dataclass(frozen=True)
+class Analogy:
+    """What was understood, and the answer."""
+
+    tree: Tree
+    """P with the component of Q."""
+    component: Component
+    scores: dict[Component, float]
+    """dB between AB and A with each component of B, best first; only components whose move changes A."""
+    trees: dict[str, Tree]
+    """The trees of A, B, P and Q."""
+
+    @property
+    def margin(self) -> float:
+        """dB by which the best explanation is nearer than the next; infinite where there is no other."""
+        best = list(self.scores.values())
+        return best[0] - best[1] if len(best) > 1 else math.inf
+
+    @property
+    def sure(self) -> bool:
+        """Is the margin large enough?"""
+        return self.margin >= SURE
+
+    def report(self) -> dict[str, Any]:
+        """What was understood, for JSON."""
+        return {
+            "component": self.component.value,
+            "sure": self.sure,
+            "margin_db": None if math.isinf(self.margin) else round(self.margin, 2),
+            "scores_db": {which.value: round(min(score, 200.0), 2) for which, score in self.scores.items()},
+            "understood": f"AB is A with the {self.component.value} of B; the answer is P with the {self.component.value} of Q",
+            "values": {name: tree.values for name, tree in {**self.trees, "answer": self.tree}.items()},
+        }
+
+
+def analogy(
+    a: Source,
+    b: Source,
+    ab: Source,
+    p: Source,
+    q: Source,
+    *,
+    preset: str = "balanced",
+    seed: int = 0,
+    told: Callable[[str], None] | None = None,
+) -> Analogy:
+    """Find what makes AB of A and B, and do it with P and Q.
+
+    Args:
+        a, b, ab, p, q: trees or pictures. Pictures other than AB are decomposed first, with ``preset`` and ``seed``.
+        told: called with the name of each picture before it is decomposed.
+    Raises:
+        PictureError: a picture cannot be used. TreeError: no component of B changes A, or the blend spaces differ.
+    """
+    seen = {}
+    for name, source in {"A": a, "B": b, "P": p, "Q": q}.items():
+        if told is not None and not isinstance(source, Tree):
+            told(name)
+        seen[name] = _seen(source, preset, seed)
+    goal = _picture(ab)
+    scores = explain(seen["A"], seen["B"].tree, *goal)
+    if not scores:
+        raise TreeError("no component of B changes A, so nothing can be understood from AB")
+    which = next(iter(scores))
+    answer = transfer(seen["Q"].tree, seen["P"].tree, which)
+    return Analogy(answer, which, scores, {name: one.tree for name, one in seen.items()})
+
+
+def explain(a: Seen, b: Tree, ab: Image, valid: Mask) -> dict[Component, float]:
+    """dB between AB and A with each component of B in turn, best first.
+
+    What the tree of A leaves of its picture unexplained is not held against any of them: changes are compared, not pictures.
+    """
+    normals = sphere_normals(SIZE)
+    before = render(a.tree, normals)
+    wanted = ab - a.image
+    found = {}
+    for which in Component:
+        change = render(transfer(b, a.tree, which), normals) - before
+        if psnr(change, torch.zeros_like(change)) < VISIBLE:
+            found[which] = psnr(change, wanted, a.valid & valid)
+    return dict(sorted(found.items(), key=lambda entry: -entry[1]))
+
+
+def _picture(source: Source) -> tuple[Image, Mask]:
+    if isinstance(source, Tree):
+        return render(source, sphere_normals(SIZE)), disc_mask(SIZE)
+    sphere = _sphere(source)
+    return sphere.image, sphere.valid
+
+
+def _sphere(source: Source) -> SphereImage:
+    if isinstance(source, SphereImage):
+        sphere = source
+    else:
+        sphere = read_sphere(source) if isinstance(source, str | Path) else sphere_from_array(source)  # type: ignore[arg-type]
+    if sphere.size != SIZE:
+        raise PictureError(f"analogy: expected spheres of {SIZE} pixels, got {sphere.size}")
+    return sphere
+
+
+def _seen(source: Source, preset: str, seed: int) -> Seen:
+    if isinstance(source, Tree):
+        return Seen(*_picture(source), source)
+    sphere = _sphere(source)
+    return Seen(sphere.image, sphere.valid, decompose(sphere, preset=preset, seed=seed).result().tree)
