@@ -183,7 +183,7 @@ def decompose(
         chosen = dataclasses.replace(chosen, effort=dataclasses.replace(chosen.effort, max_values=max_values))
     if search == "depth":
         return Decomposition(_by_depth(sphere, chosen, seed, objective), sphere, seed, preset)
-    return Decomposition(_by_size(sphere, chosen, seed, alternatives), sphere, seed, preset)
+    return Decomposition(_without_gradients(_by_size(sphere, chosen, seed, alternatives)), sphere, seed, preset)
 
 
 def fit(image: SphereImage | torch.Tensor | Any | str | Path, tree: Tree, *, locked: Collection[str] = (), seed: int = 0) -> Result:
@@ -264,6 +264,16 @@ def _samples(sphere: SphereImage, preset: Preset, seed: int) -> Samples:
     points = Pixels.points(sphere.image, sphere.valid, POINTS, seed)
     fine = Pixels.important(sphere.image, sphere.valid, preset.fine, seed)
     return Samples(coarse, points, fine, _shared_dictionary(coarse), _shared_dictionary(points))
+
+
+def _without_gradients(work: Iterator[Step | Result]) -> Iterator[Step | Result]:
+    """Take each step in inference mode, which is faster; the caller between steps is not in it."""
+    while True:
+        with torch.inference_mode():
+            found = next(work, None)
+        if found is None:
+            return
+        yield found
 
 
 def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int) -> Iterator[Step | Result]:

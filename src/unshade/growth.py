@@ -14,8 +14,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-import torch
-
 from unshade.atoms import Dictionary
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
 from unshade.fit.model import NO_LIMITS, Limits, Model
@@ -120,8 +118,7 @@ class Growth:
         sizes = sorted(known)
         if len(sizes) > most:
             sizes = sorted({sizes[round(k * (len(sizes) - 1) / (most - 1))] for k in range(most)})
-        with torch.no_grad():
-            return [self.fit(known[values].root, self.samples.points, self.effort.growth_steps) for values in sizes]
+        return [self.fit(known[values].root, self.samples.points, self.effort.growth_steps) for values in sizes]
 
     def judge(self, error: float, values: int) -> float:
         """Lower is better."""

@@ -111,12 +111,13 @@ def _layout(outline: tuple[tuple[str, str, int, bool], ...]) -> Layout:
             logarithmic += [parameter.logarithmic] * count
             free += [amplitude_is_free or parameter.name != kind.amplitude] * count
         slots.append(tuple(own))
-    return Layout(
-        tuple(slots),
-        tuple(names),
-        tuple(types),
-        torch.tensor(lower, dtype=torch.float64),
-        torch.tensor(upper, dtype=torch.float64),
-        torch.tensor(logarithmic, dtype=torch.bool),
-        torch.tensor(free, dtype=torch.bool),
-    )
+    with torch.inference_mode(False):  # layouts are shared, also with fits by gradient
+        return Layout(
+            tuple(slots),
+            tuple(names),
+            tuple(types),
+            torch.tensor(lower, dtype=torch.float64),
+            torch.tensor(upper, dtype=torch.float64),
+            torch.tensor(logarithmic, dtype=torch.bool),
+            torch.tensor(free, dtype=torch.bool),
+        )

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-import torch
-
 from unshade.fit.least_squares import FINE_SOFTNESS, fit_pixels
 from unshade.fit.pixels import Pixels
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
@@ -37,36 +35,35 @@ class Search(Growth):
 
     def run(self) -> Iterator[tuple[str, Candidate]]:
         """(stage, candidate) as they come; the last one is the result."""
-        with torch.no_grad():
-            current = Candidate(self.start(), math.inf)
-            for current in self.grow(current, self.samples.coarse, self.samples.coarse_dictionary, 1e-4, self.early):
-                yield "grow", current
-            plain: Candidate | None = None
-            if self.effort.beam and self.complete:
-                drawn = DrawnSearch(self.samples, self.effort)
-                plain = yield from drawn.run(self.rough.members())
-                self.front.update(drawn.front)
-                self.rough.update(drawn.rough)
-                if plain is not None and plain.error < DRAWN:
-                    yield "polish", plain
-                    return
-            current = self.fit(current.root, self.samples.points, self.effort.growth_steps)
-            for current in self.grow(current, self.samples.points, self.samples.points_dictionary, FLOOR, self.families):
-                yield "grow", current
-            for _ in range(self.effort.sweeps):
-                current = self._sweep(current, self.samples.points)
-                yield "swap", current
-            for number in range(self.effort.rounds):
-                better = self._exchange(current, number)
-                if self.judge(better.error, better.values) < self.judge(current.error, current.values):
-                    current = better
-                    yield "exchange", current
-            current = self.sharpen(current)
-            if self.effort.beam and self.complete and current.error < DRAWN:
-                current = DrawnSearch(self.samples, self.effort).prune(current, 6)
-            if plain and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
-                current = plain
-            yield "polish", current
+        current = Candidate(self.start(), math.inf)
+        for current in self.grow(current, self.samples.coarse, self.samples.coarse_dictionary, 1e-4, self.early):
+            yield "grow", current
+        plain: Candidate | None = None
+        if self.effort.beam and self.complete:
+            drawn = DrawnSearch(self.samples, self.effort)
+            plain = yield from drawn.run(self.rough.members())
+            self.front.update(drawn.front)
+            self.rough.update(drawn.rough)
+            if plain is not None and plain.error < DRAWN:
+                yield "polish", plain
+                return
+        current = self.fit(current.root, self.samples.points, self.effort.growth_steps)
+        for current in self.grow(current, self.samples.points, self.samples.points_dictionary, FLOOR, self.families):
+            yield "grow", current
+        for _ in range(self.effort.sweeps):
+            current = self._sweep(current, self.samples.points)
+            yield "swap", current
+        for number in range(self.effort.rounds):
+            better = self._exchange(current, number)
+            if self.judge(better.error, better.values) < self.judge(current.error, current.values):
+                current = better
+                yield "exchange", current
+        current = self.sharpen(current)
+        if self.effort.beam and self.complete and current.error < DRAWN:
+            current = DrawnSearch(self.samples, self.effort).prune(current, 6)
+        if plain and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
+            current = plain
+        yield "polish", current
 
     def _sweep(self, current: Candidate, pixels: Pixels) -> Candidate:
         """Offer every leaf another kind, or none at all, until nothing pays."""

@@ -111,8 +111,8 @@ def forward_mode(kind: str, normals: torch.Tensor, parameters: list[torch.Tensor
     Returns:
         (D, K, C, N).
     """
-    with forward_ad.dual_level():
-        dual = [forward_ad.make_dual(p.expand_as(t).contiguous(), t.contiguous()) for p, t in zip(parameters, tangents, strict=True)]
+    with torch.inference_mode(False), forward_ad.dual_level():  # dual numbers are lost in inference mode
+        dual = [forward_ad.make_dual(p.expand_as(t).clone(), t.clone()) for p, t in zip(parameters, tangents, strict=True)]
         tangent = forward_ad.unpack_dual(KINDS[kind].formula(normals, *dual)).tangent
         shape = tangents[0].shape[:2]
     return tangent.expand(*shape, *tangent.shape[-3:])[..., 0, :]
