@@ -33,7 +33,7 @@ $(VENV)/.user: pyproject.toml constraints.txt
 
 $(VENV)/.dev: $(VENV)/.user
 	@echo "adding the tools for the checks"
-	@$(PIP) --no-build-isolation --editable '.[exr,video,perceptual,bench,dev]'
+	@$(PIP) --no-build-isolation --editable '.[exr,video,perceptual,bench,train,dev]'
 	@touch $@
 
 demo: $(VENV)/.user

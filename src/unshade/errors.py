@@ -55,6 +55,10 @@ class MissingExtraError(UnshadeError):
     exit_code = 6
 
 
+class MissingWeightsError(MissingExtraError):
+    """The trained weights of a network are not where they are looked for."""
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """`` - did you mean 'x'?`` for the nearest known word, or the list of them."""
     known = list(known)

@@ -1,0 +1,116 @@
+"""The state of a training run on disk: everything that its next step depends on, in one file that is always whole.
+
+A safetensors file: the model's and the optimiser's tensors, and the rest as JSON in the header. Randomness needs no state: that of a step
+depends on the seed and the step's number alone.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+from unshade.errors import UnshadeError
+from unshade.files import write_whole
+from unshade.models.config import Config, ConfigError
+
+
+class CheckpointError(UnshadeError):
+    """A training state that is damaged, or belongs to another run."""
+
+
+@dataclass
+class Position:
+    """How far a run is: ``step`` steps done in ``seconds``; the losses since the last report add up to ``loss_sum`` over ``loss_count``."""
+
+    step: int = 0
+    seconds: float = 0.0
+    loss_sum: float = 0.0
+    loss_count: int = 0
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What must be the same for a run to go on."""
+
+    task: str
+    config: Config
+    style: str
+    seed: int
+    precision: str
+    processes: int
+
+    def header(self) -> dict[str, str]:
+        """As strings, for a file."""
+        return {
+            "task": self.task,
+            "config": self.config.to_json(),
+            "style": self.style,
+            "seed": str(self.seed),
+            "precision": self.precision,
+            "processes": str(self.processes),
+        }
+
+
+def save(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, position: Position, identity: Identity) -> None:
+    """Write the state, whole or not at all. Raises OutputError."""
+    tensors = {f"model.{key}": value for key, value in model.state_dict().items()}
+    for number, values in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{number}.{key}": value for key, value in values.items()}
+    header = identity.header() | {"position": json.dumps(vars(position))}
+    write_whole(path, safetensors.torch.save({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, header))
+
+
+def resume(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, identity: Identity) -> Position:
+    """Put the state of a file into a model and its optimiser.
+
+    The steps and rates of training may have been changed since; sizes, batch, style, seed, precision and processes may not.
+
+    Raises:
+        CheckpointError: the file is damaged, or of another run.
+    """
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            header: dict[str, str] = file.metadata() or {}
+        tensors = safetensors.torch.load_file(path)
+    except (safetensors.SafetensorError, OSError, ValueError) as error:
+        raise CheckpointError(f"{path}: the training state is damaged ({error}); delete it to begin again") from None
+    _check(path, header, identity)
+    try:
+        model.load_state_dict({key.removeprefix("model."): value for key, value in tensors.items() if key.startswith("model.")})
+        state: dict[int, dict[str, Tensor]] = {}
+        for key, value in tensors.items():
+            if key.startswith("optimizer."):
+                _, number, name = key.split(".", 2)
+                state.setdefault(int(number), {})[name] = value
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+        return Position(**json.loads(header["position"]))
+    except (RuntimeError, KeyError, TypeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(f"{path}: the training state does not fit this version ({reason}); delete it to begin again") from None
+
+
+def _check(path: Path, header: dict[str, str], identity: Identity) -> None:
+    wanted = identity.header()
+    for key in sorted(wanted):
+        was: Any = header.get(key)
+        now: Any = wanted[key]
+        if key == "config" and was is not None:
+            try:
+                was, now = (_fixed(config, identity.task) for config in (Config.from_json(was), identity.config))
+            except ConfigError as error:
+                raise CheckpointError(f"{path}: the training state is damaged ({error}); delete it to begin again") from None
+        if was != now:
+            what = f"another {key}" if key == "config" else f"{key} {was}, not {now}"
+            raise CheckpointError(f"{path}: this run was begun with {what}; go on with the same, or choose another folder")
+
+
+def _fixed(config: Config, task: str) -> tuple[Any, ...]:
+    """What of a configuration cannot change on the way."""
+    return config.size, config.vqvae, config.prior, config.heads, config.training[task].batch

@@ -1,0 +1,126 @@
+"""The command `unshade train`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from unshade.arguments import SEED
+from unshade.staging import check_folder
+
+if TYPE_CHECKING:
+    from unshade.models.config import Config
+    from unshade.terminal import Messages
+    from unshade.train import Progress
+
+MODELS = ("vqvae", "prior", "heads")
+"""What `all` trains, in this order; the names are those of `unshade.train.TASKS`."""
+
+
+@click.command()
+@click.argument("model", type=click.Choice([*MODELS, "all"]))
+@click.option(
+    "--config", default="small", show_default=True, metavar="NAME", help="small (hours on two cores), paper (a GPU), or tiny (a test)."
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("out/train"),
+    show_default=True,
+    metavar="DIR",
+    help="Folder of the run: states, curves, pictures, and the weights in DIR/weights.",
+)
+@click.option("--steps", type=click.IntRange(1), metavar="N", help="Steps in all instead of the configuration's.")
+@click.option("--batch", type=click.IntRange(1), metavar="N", help="Examples of a step and process instead of the configuration's.")
+@click.option(
+    "--style", type=click.Choice(["both", "realistic", "toon"]), default="both", show_default=True, help="Which trees to learn from."
+)
+@click.option("--seed", type=SEED, default=0, show_default="0", metavar="N", help="The same seed gives the same training.")
+@click.option(
+    "--precision",
+    type=click.Choice(["auto", "float32", "bfloat16"]),
+    default="auto",
+    show_default=True,
+    help="Of large products; auto is bfloat16 on a GPU that has it. Some CPUs are twice as fast with bfloat16.",
+)
+@click.option(
+    "--workers", type=click.IntRange(0), default=0, show_default=True, metavar="N", help="Processes that make data beside the training."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object a report, one a line, on standard output.")
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
+def train(
+    model: str,
+    config: str,
+    output: Path,
+    steps: int | None,
+    batch: int | None,
+    as_json: bool,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Train the networks of the learned method.
+
+    vqvae is the encoder and decoder of node images, prior draws children, heads are the operator, mask and type networks; prior needs a
+    trained vqvae. `all` trains each in turn, evaluates it on unseen nodes, and writes weights and a model card to DIR/weights. A call goes
+    on where the last one stopped: after Ctrl-C at that step, after a kill at the last save, a minute before at most.
+
+    Several GPUs: torchrun --nproc-per-node 8 -m unshade train vqvae --config paper
+
+    \b
+    Examples:
+      unshade train all --config small -o run
+      unshade train vqvae --config paper --batch 64 -o paper
+    """
+    from unshade import train as loop
+    from unshade.models.config import find
+    from unshade.terminal import Messages
+
+    check_folder(output)
+    found, messages = find(config), Messages(quiet or not loop.leads())
+    for task in MODELS if model == "all" else (model,):
+        run = loop.Run(task, _changed(found, task, steps, batch), output, **options)
+        for progress in loop.train(run):
+            _tell(progress, messages, as_json and loop.leads())
+    if model == "all" and loop.leads():
+        from unshade.model_card import write_card
+
+        messages.say(f"weights and model card: {write_card(output / 'weights')}")
+
+
+def _changed(config: Config, task: str, steps: int | None, batch: int | None) -> Config:
+    """The configuration with what the command line says."""
+    training = config.training[task]
+    training = dataclasses.replace(training, steps=steps or training.steps, batch=batch or training.batch)
+    return dataclasses.replace(config, training={**config.training, task: training})
+
+
+def _tell(progress: Progress, messages: Messages, as_json: bool) -> None:
+    """A report as a line for a person, or as JSON."""
+    for note in progress.notes:
+        messages.say(f"{progress.task}: {note}", "dim")
+    if not progress.figures:
+        return
+    if as_json:
+        click.echo(json.dumps({key: value for key, value in dataclasses.asdict(progress).items() if key != "notes"}))
+    figures = "  ".join(f"{key} {value:.4g}" for key, value in progress.figures.items())
+    messages.say(
+        f"{progress.task} {progress.step}/{progress.steps}  loss {progress.loss:.4f}  {figures}  {_duration(progress.seconds_left)} left"
+    )
+    if progress.test:
+        messages.say("  unseen: " + "  ".join(f"{key} {value:.4g}" for key, value in progress.test.items()), "bold")
+
+
+def _duration(seconds: float) -> str:
+    """``1 h 05 min``, ``12 min`` or ``40 s``."""
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes >= 60:
+        return f"{minutes // 60} h {minutes % 60:02d} min"
+    return f"{minutes} min" if minutes else f"{rest} s"
+
+
+VERBS = (train,)

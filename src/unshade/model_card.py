@@ -1,0 +1,96 @@
+"""The page about trained weights, from what stands in their files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from unshade.files import write_whole
+from unshade.models import weights
+
+TITLES = {
+    "vqvae": "VQ-VAE-2: node images to codes and back",
+    "prior": "Priors: the codes of children",
+    "heads": "Heads: operator (f), mask (g) and type (h)",
+}
+
+MEANINGS = {
+    "psnr": "PSNR of decoded node images, dB",
+    "psnr_worst_tenth": "PSNR that nine nodes in ten reach, dB",
+    "psnr_parents": "PSNR of parents alone, dB",
+    "top_codes_used": "top codes used at all",
+    "top_perplexity": "perplexity of the top codes",
+    "bottom_codes_used": "bottom codes used at all",
+    "bottom_perplexity": "perplexity of the bottom codes",
+    "first_top": "top codes of the first child, nats a code",
+    "first_bottom": "bottom codes of the first child, nats a code",
+    "second_top": "top codes of the second child, nats a code",
+    "second_bottom": "bottom codes of the second child, nats a code",
+    "operator": "operators right",
+    "type": "types right",
+    "mask_iou": "mask IoU",
+    "mix_psnr": "PSNR of the parent mixed by the mask, dB",
+    "operator_decoded": "operators right, children decoded from codes",
+    "type_decoded": "types right, children decoded from codes",
+    "mask_iou_decoded": "mask IoU, children decoded from codes",
+    "mix_psnr_decoded": "PSNR of the parent mixed by the mask, children decoded from codes, dB",
+}
+STYLES = ("realistic", "toon")
+
+HEAD = """# Model card
+
+The weights that ship with `unshade`, written by `unshade train all` and read by the learned method. This page is made from what
+stands in the files (`scripts/model_card.py`). Safetensors, parameters in half precision; how they were trained: [training](training.md).
+
+Made for node images of shade trees: synthetic shaded spheres of the released grammar, black outside the disc. Figures are of nodes from
+the test half of the data, whose colours, directions, masks and environment maps occur in no training tree. Photographs of real spheres are
+another distribution, and nothing here says how well it goes there.
+"""
+
+
+def page(folder: Path) -> str:
+    """The card of all weights in a folder, as Markdown. Raises MissingWeightsError, WeightsError."""
+    return HEAD + "".join(_section(name, folder) for name in TITLES if weights.file_of(name, folder).is_file())
+
+
+def write_card(folder: Path) -> Path:
+    """Put the page beside the weights. Raises OutputError."""
+    path = folder / "model-card.md"
+    write_whole(path, page(folder).encode())
+    return path
+
+
+def _section(name: str, folder: Path) -> str:
+    path = weights.file_of(name, folder)
+    card = weights.read_card(path)
+    finished = "" if card["steps"] >= card["of"] else f" of {card['of']:,}: not finished"
+    lines = [
+        f"## {TITLES[name]}",
+        "",
+        f"`{path.name}`, {path.stat().st_size / 2**20:.1f} MiB, configuration `{card['config']}`.",
+        "",
+        f"- Data: {card['data']}; {card['examples']:,} examples.",
+        f"- Training: {card['steps']:,} steps{finished}, {card['hours']:.1f} hours on {card['hardware']}, precision {card['precision']}, "
+        f"PyTorch {card['torch']}.",
+        "",
+        *_table(card["figures"]),
+    ]
+    return "\n" + "\n".join(lines) + "\n"
+
+
+def _table(figures: dict[str, Any]) -> list[str]:
+    """A row a figure, a column a style."""
+    rows = [
+        f"| {MEANINGS[key]} | {' | '.join(_number(figures.get(f'{style}_{key}')) for style in STYLES)} |"
+        for key in MEANINGS
+        if _has(figures, key)
+    ]
+    return ["| unseen nodes | realistic | toon |", "|---|---|---|", *rows]
+
+
+def _has(figures: dict[str, Any], key: str) -> bool:
+    return any(f"{style}_{key}" in figures for style in STYLES)
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"

@@ -1,0 +1,252 @@
+"""PixelSNAIL: a distribution over a map of codes, drawn code by code in reading order under a condition.
+
+After Chen et al. 2018, "PixelSNAIL: An Improved Autoregressive Generative Model": blocks of gated causal convolutions, each block
+followed by causal attention over everything before. Every layer does two things: `forward` over a whole map, for training, and
+`step` at one position over what it kept of the positions before, for sampling. So a new code costs one step, not a pass over the map.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from unshade.models.config import PriorConfig
+
+Cache = dict[Any, Tensor]
+"""What layers keep between the steps of one sampling run, by layer."""
+
+
+def _norm(x: Tensor, gain: Tensor) -> Tensor:
+    """Root mean square 1 across the channels, dimension 1, at each position alone: so it is causal and the same in a step."""
+    shape = (-1, *(1,) * (x.ndim - 2))
+    return x * torch.rsqrt(x.square().mean(1, keepdim=True) + 1e-6) * gain.view(shape)
+
+
+class CausalConvolution(nn.Module):
+    """A convolution of the row above and the row itself up to the position, or short of it (``strict``)."""
+
+    kept: Tensor
+
+    def __init__(self, inputs: int, outputs: int, strict: bool = False) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(inputs, outputs, (2, 3 if strict else 2))
+        self.right = 1 if strict else 0
+        kept = torch.ones(2, 2 + self.right)
+        if strict:
+            kept[1, 1:] = 0.0
+        self.register_buffer("kept", kept, persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, outputs, H, W)."""
+        weight = self.convolution.weight * self.kept if self.right else self.convolution.weight
+        return F.conv2d(F.pad(x, (1, self.right, 1, 0)), weight, self.convolution.bias)
+
+    def begin(self, cache: Cache, count: int, height: int, width: int) -> None:
+        """Keep zeros around the map, and the weights in the order of a patch."""
+        weight = self.convolution.weight * self.kept
+        cache[self] = weight.new_zeros(count, height + 1, width + 1 + self.right, weight.shape[1])
+        cache[self, "weight"] = weight.permute(2, 3, 1, 0).reshape(-1, weight.shape[0]).contiguous()
+
+    def put(self, cache: Cache, row: int, column: int, x: Tensor) -> None:
+        """Remember the input (N, C) at a position."""
+        cache[self][:, row + 1, column + 1] = x
+
+    def take(self, cache: Cache, row: int, column: int) -> Tensor:
+        """The output (N, outputs) at a position, from what was put there and before."""
+        patch = cache[self][:, row : row + 2, column : column + 2 + self.right].flatten(1)
+        return torch.addmm(self.convolution.bias, patch, cache[self, "weight"])  # type: ignore[arg-type]
+
+    def step(self, cache: Cache, row: int, column: int, x: Tensor) -> Tensor:
+        """Put, then take."""
+        self.put(cache, row, column, x)
+        return self.take(cache, row, column)
+
+
+class GatedLayer(nn.Module):
+    """``x + a * sigmoid(b)``, where a and b come from causal convolutions of x, from the condition, and from ``aside`` if there is one."""
+
+    def __init__(self, channels: int, condition: int, dropout: float, aside: bool = False) -> None:
+        super().__init__()
+        self.gain = nn.Parameter(torch.ones(channels))
+        self.first = CausalConvolution(channels, channels)
+        self.aside = nn.Linear(channels, channels, bias=False) if aside else None
+        self.second = CausalConvolution(channels, 2 * channels)
+        self.told = nn.Conv2d(condition, 2 * channels, 1)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, condition: Tensor, aside: Tensor | None = None) -> Tensor:
+        """x, aside (B, C, H, W), condition (B, D, H, W) to (B, C, H, W)."""
+        inner = self.first(F.elu(_norm(x, self.gain)))
+        if self.aside is not None and aside is not None:
+            inner = inner + F.conv2d(aside, self.aside.weight[:, :, None, None])
+        value, gate = (self.second(self.dropout(F.elu(inner))) + self.told(condition)).chunk(2, 1)
+        return x + value * torch.sigmoid(gate)
+
+    def begin(self, cache: Cache, condition: Tensor) -> None:
+        """Read the whole condition (N, D, H, W) at once: it is known before the first step."""
+        count, _, height, width = condition.shape
+        for convolution in (self.first, self.second):
+            convolution.begin(cache, count, height, width)
+        cache[self] = self.told(condition).permute(2, 3, 0, 1).contiguous()
+
+    def step(self, cache: Cache, row: int, column: int, x: Tensor, aside: Tensor | None = None) -> Tensor:
+        """`forward` at one position: x, aside (N, C)."""
+        inner = self.first.step(cache, row, column, F.elu(_norm(x, self.gain)))
+        if self.aside is not None and aside is not None:
+            inner = inner + self.aside(aside)
+        value, gate = (self.second.step(cache, row, column, F.elu(inner)) + cache[self][row, column]).chunk(2, 1)
+        return x + value * torch.sigmoid(gate)
+
+
+class CausalAttention(nn.Module):
+    """Every position looks at the codes and features of all positions before it, and at nothing where there is none.
+
+    Keys and values are moved on by one place, with zeros in the first, so that attention up to a position is attention before it.
+    """
+
+    def __init__(self, channels: int, inputs: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.gain = nn.Parameter(torch.ones(channels))
+        self.ask = nn.Linear(channels + 2, channels)
+        self.offer = nn.Linear(channels + inputs + 2, 2 * channels)
+
+    def _split(self, x: Tensor) -> Tensor:
+        """(N, L, C) to (N, heads, L, C / heads)."""
+        return x.unflatten(2, (self.heads, -1)).transpose(1, 2)
+
+    def forward(self, x: Tensor, seen: Tensor, places: Tensor) -> Tensor:
+        """x (B, C, H, W), the entries of the codes ``seen`` (B, E, H, W) and ``places`` (1, 2, H, W) to (B, C, H, W)."""
+        height, width = x.shape[-2:]
+        x = _norm(x, self.gain)
+        places = places.expand(len(x), -1, -1, -1)
+        queries = self.ask(torch.cat([x, places], 1).flatten(2).transpose(1, 2))
+        offered = self.offer(torch.cat([x, seen, places], 1).flatten(2).transpose(1, 2))
+        keys, values = F.pad(offered, (0, 0, 1, 0))[:, :-1].chunk(2, 2)
+        out = F.scaled_dot_product_attention(self._split(queries), self._split(keys), self._split(values), is_causal=True)
+        return out.transpose(1, 2).flatten(2).transpose(1, 2).unflatten(2, (height, width))
+
+    def begin(self, cache: Cache, count: int, length: int) -> None:
+        """Room for all keys and values, the empty one first."""
+        width = self.offer.out_features // 2 // self.heads
+        cache[self] = self.offer.weight.new_zeros(2, count, self.heads, length + 1, width)
+
+    def step(self, cache: Cache, position: int, x: Tensor, places: Tensor) -> Tensor:
+        """The look at one position: x (N, C), places (2,) to (N, C)."""
+        x = torch.cat([_norm(x, self.gain), places.expand(len(x), 2)], 1)
+        cache[self, "asked"] = x
+        query = self.ask(x).unflatten(1, (self.heads, 1, -1))
+        keys, values = cache[self][:, :, :, : position + 1]
+        return F.scaled_dot_product_attention(query, keys, values).flatten(1)
+
+    def remember(self, cache: Cache, position: int, seen: Tensor) -> None:
+        """Offer a position to later ones, now that its code is drawn: entries ``seen`` (N, E)."""
+        asked = cache[self, "asked"]
+        offered = self.offer(torch.cat([asked[:, :-2], seen, asked[:, -2:]], 1))
+        cache[self][:, :, :, position + 1] = offered.unflatten(1, (2, self.heads, -1)).transpose(0, 1)
+
+
+class Block(nn.Module):
+    """Gated layers, attention, and a gated layer that joins the two."""
+
+    def __init__(self, inputs: int, config: PriorConfig) -> None:
+        super().__init__()
+        sizes = (config.channels, config.condition_channels, config.dropout)
+        self.layers = nn.ModuleList(GatedLayer(*sizes) for _ in range(config.layers))
+        self.attention = CausalAttention(config.channels, inputs, config.heads)
+        self.join = GatedLayer(*sizes, aside=True)
+
+
+class PixelSNAIL(nn.Module):
+    """Logits of every code of a (size x size) map given the codes before it, in reading order, and a condition.
+
+    The codes' entries in their codebook, (K, E), are given with every call: alike codes are alike inputs.
+    """
+
+    places: Tensor
+
+    def __init__(self, size: int, codes: int, entry_channels: int, config: PriorConfig) -> None:
+        super().__init__()
+        self.size = size
+        self.enter = CausalConvolution(entry_channels, config.channels, strict=True)
+        self.told = nn.Conv2d(config.condition_channels, config.channels, 1)
+        self.blocks = nn.ModuleList(Block(entry_channels, config) for _ in range(config.blocks))
+        self.gain = nn.Parameter(torch.ones(config.channels))
+        self.leave = nn.Linear(config.channels, codes)
+        steps = torch.linspace(-1.0, 1.0, size)
+        self.register_buffer("places", torch.stack(torch.meshgrid(steps, steps, indexing="ij"))[None], persistent=False)
+
+    def forward(self, numbers: Tensor, entries: Tensor, condition: Tensor) -> Tensor:
+        """numbers (B, H, W), entries (K, E), condition (B, D, H, W) to logits (B, K, H, W)."""
+        seen = F.embedding(numbers, entries).permute(0, 3, 1, 2)
+        x = self.enter(seen) + self.told(condition)
+        for block in self.blocks:
+            assert isinstance(block, Block)
+            for layer in block.layers:
+                x = layer(x, condition)
+            x = block.join(x, condition, block.attention(x, seen, self.places))
+        return F.conv2d(F.elu(_norm(x, self.gain)), self.leave.weight[:, :, None, None], self.leave.bias)
+
+    @torch.no_grad()
+    def sample(self, entries: Tensor, condition: Tensor, generator: torch.Generator, temperature: float = 1.0) -> Tensor:
+        """Draw a map of codes for each condition, all as one batch.
+
+        Args:
+            entries: (K, E) of the codebook.
+            condition: (N, D, H, W).
+            generator: source of all randomness, on the same device.
+            temperature: 1 draws from the distribution, less makes likely codes likelier, 0 takes the likeliest.
+        Returns:
+            (N, H, W) int64.
+        """
+        count, size = len(condition), self.size
+        cache: Cache = {}
+        self.enter.begin(cache, count, size, size)
+        told = self.told(condition).permute(2, 3, 0, 1).contiguous()
+        for block in self.blocks:
+            assert isinstance(block, Block)
+            for layer in [*block.layers, block.join]:
+                layer.begin(cache, condition)  # type: ignore[operator]
+            block.attention.begin(cache, count, size * size)
+        drawn = condition.new_zeros(count, size, size, dtype=torch.int64)
+        for position in range(size * size):
+            row, column = divmod(position, size)
+            number = _draw(self._step(cache, row, column, told[row, column]), generator, temperature)
+            drawn[:, row, column] = number
+            seen = F.embedding(number, entries)
+            self.enter.put(cache, row, column, seen)
+            for block in self.blocks:
+                block.attention.remember(cache, position, seen)  # type: ignore[operator,union-attr]
+        return drawn
+
+    def _step(self, cache: Cache, row: int, column: int, told: Tensor) -> Tensor:
+        """The logits (N, K) of one position, from the cached features of those before."""
+        x = self.enter.take(cache, row, column) + told
+        places = self.places[0, :, row, column]
+        for block in self.blocks:
+            assert isinstance(block, Block)
+            for layer in block.layers:
+                x = layer.step(cache, row, column, x)  # type: ignore[operator]
+            looked = block.attention.step(cache, row * self.size + column, x, places)
+            x = block.join.step(cache, row, column, x, looked)
+        return self.leave(F.elu(_norm(x, self.gain)))
+
+    @torch.no_grad()
+    def sample_uncached(self, entries: Tensor, condition: Tensor, generator: torch.Generator, temperature: float = 1.0) -> Tensor:
+        """`sample` by a pass over the whole map for every code: slow, and what the fast one is tested against."""
+        drawn = condition.new_zeros(len(condition), self.size, self.size, dtype=torch.int64)
+        for position in range(self.size * self.size):
+            row, column = divmod(position, self.size)
+            logits = self(drawn, entries, condition)[:, :, row, column]
+            drawn[:, row, column] = _draw(logits, generator, temperature)
+        return drawn
+
+
+def _draw(logits: Tensor, generator: torch.Generator, temperature: float) -> Tensor:
+    """One number for each row of logits (N, K)."""
+    if temperature == 0.0:
+        return logits.argmax(1)
+    return torch.multinomial(torch.softmax(logits.float() / temperature, 1), 1, generator=generator)[:, 0]
