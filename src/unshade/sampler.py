@@ -58,7 +58,7 @@ def all_canonical_structures(style: str | None = None, environment: bool | None 
         environment, rim: with (True), without (False), or both (None). An environment is counted with one lobe.
     """
     styles = STYLES if style is None else (_known_style(style),)
-    return [structure_key(_default(structure)) for name in styles for structure in _structures(name, environment, rim)]
+    return [structure_key(_default(structure)) for name in styles for structure in structures(name, environment, rim)]
 
 
 def sample(
@@ -84,7 +84,7 @@ def sample(
     """
     panorama = environment if isinstance(environment, Raster) else None
     with_environment = _either(generator, True if isinstance(environment, Raster) else environment)
-    choices = _structures(_known_style(style), with_environment, _either(generator, rim))
+    choices = structures(_known_style(style), with_environment, _either(generator, rim))
     structure = choices[_integer(generator, len(choices))]
     count = lobes if lobes is not None else 2 + _integer(generator, 3)
     for _ in range(ATTEMPTS):
@@ -130,7 +130,8 @@ def _styled(structure: Structure) -> Structure:
 
 
 @lru_cache(maxsize=32)
-def _structures(style: str, environment: bool | None, rim: bool | None) -> tuple[Structure, ...]:
+def structures(style: str, environment: bool | None, rim: bool | None) -> tuple[Structure, ...]:
+    """The structures of a style of the released grammar; with, without, or either (None) of an environment and a rim."""
     found = []
     for structure in _derivations("S"):
         kinds = set(_kinds(structure))

@@ -1,0 +1,261 @@
+"""Synthetic training data: trees drawn from the grammar, and every operator of theirs as an example.
+
+A tree is drawn as `sampler` draws it: its structure first, each equally likely, then its numbers until every leaf shows. A
+share of the trees is drawn wider than the released grammar: realistic ones with the broad and coloured lights of real
+pictures, toon ones as people draw, with warm-cool ramps, hard lights and outlines. Trees have numbers: tree n depends only
+on (style, split, seed, n), so data can be made anywhere and in any order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import random
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import count
+from typing import Any, Literal, TypeAlias
+
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from unshade.base_nodes import SPLITS
+from unshade.blend import BLENDS
+from unshade.errors import TreeError, did_you_mean
+from unshade.forest import CODES, Forest, Outline, Plant, grow
+from unshade.nodes import Tree
+from unshade.sampler import Structure, structures
+from unshade.sphere import disc_mask, sphere_normals
+from unshade.types import Image, Mask
+
+OPERATORS = ("multiply", "screen", "mix")
+"""Classes of an example's operator."""
+
+TYPES = ("operator", "albedo", "diffuse", "toon_diffuse", "highlight", "toon_highlight", "rim", "environment")
+"""Classes of a child; an ``operator`` is to be decomposed further."""
+
+Style: TypeAlias = Literal["realistic", "toon", "both"]
+STYLES = ("realistic", "toon", "both")
+
+GROVE = 32
+"""Trees that are drawn together; tree n is in grove n // GROVE."""
+
+WIDE_SHARE = {"realistic": 0.3, "toon": 0.5}
+"""Of the trees, those drawn wider than the released grammar."""
+
+MIXED_BATCHES = 16
+"""Batches that are shuffled together, so that the nodes of one tree do not all fall into one batch; fewer where they are large."""
+
+MIXED_NUMBERS = 1 << 25
+"""Pixels times examples that are shuffled together, at most."""
+
+EXAMPLES_OF_A_TREE = 5.0
+"""Operators of a tree, a little fewer than on the average."""
+
+_TYPE_CODES = torch.tensor(
+    [TYPES.index("environment" if kind == "environment_map" else kind) if kind in (*TYPES, "environment_map") else 0 for kind in CODES]
+)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Examples: operators of trees with their operands. Images are display-encoded in [0, 1] and 0 outside the disc."""
+
+    parent: Image
+    """(B, 3, S, S)."""
+    left: Image
+    right: Image
+    operator: torch.Tensor
+    """(B,) int64, index of `OPERATORS`."""
+    mask: Mask
+    """(B, 1, S, S), 0 where the operator is not a mix."""
+    left_type: torch.Tensor
+    """(B,) int64, index of `TYPES`."""
+    right_type: torch.Tensor
+
+    def to(self, device: torch.device | str) -> Batch:
+        """The same on another device."""
+        return Batch(*[getattr(self, field.name).to(device, non_blocking=True) for field in dataclasses.fields(self)])
+
+    def __getitem__(self, rows: slice | torch.Tensor) -> Batch:
+        """Some of the examples."""
+        return Batch(*[getattr(self, field.name)[rows] for field in dataclasses.fields(self)])
+
+    def __len__(self) -> int:
+        """Examples."""
+        return len(self.operator)
+
+
+def trees(style: Style, split: str, *, seed: int, start: int = 0) -> Iterator[Tree]:
+    """Endless trees, the first of them tree ``start``; every operator has two children, in the order of the released grammar.
+
+    Args:
+        style: realistic, toon, or both, one tree in two of each.
+        split: the half of the base nodes, train or test.
+    Raises:
+        TreeError: an unknown style or split.
+    """
+    _check(style, split)
+    for grove in count(start // GROVE):
+        first = start % GROVE if grove == start // GROVE else 0
+        for plant in plants(style, split, seed, grove)[first:]:
+            yield plant.tree()
+
+
+def batches(
+    style: Style,
+    split: str,
+    *,
+    size: int,
+    batch: int,
+    seed: int,
+    start: int = 0,
+    workers: int = 0,
+    device: torch.device | str = "cpu",
+) -> Iterator[Batch]:
+    """Endless shuffled examples, the first of them batch ``start``.
+
+    Batch k depends only on (style, split, size, batch, seed, k): neither on where the stream began nor on the workers.
+
+    Args:
+        size: width and height of the images.
+        batch: examples in a batch.
+        workers: processes that prepare batches ahead, on the CPU; 0 prepares them here, on ``device``.
+    Raises:
+        TreeError: an unknown style or split.
+    """
+    _check(style, split)
+    mixed = max(1, min(MIXED_BATCHES, MIXED_NUMBERS // (batch * size * size)))
+    blocks = _Blocks(style, split, size, batch, seed, mixed, torch.device("cpu" if workers else device))
+    first = start // mixed
+    loaded: Iterator[Batch]
+    if workers:
+        numbers = _Counted(first)
+        loader = DataLoader(blocks, batch_size=None, sampler=numbers, num_workers=workers, prefetch_factor=2, collate_fn=_as_it_is)
+        loaded = iter(loader)
+    else:
+        loaded = (blocks[number] for number in count(first))
+    for number, block in enumerate(loaded, start=first):
+        for k in range(start - first * mixed if number == first else 0, mixed):
+            yield block[slice(k * batch, (k + 1) * batch)].to(device)
+
+
+def examples(grown: Sequence[Plant], size: int, device: torch.device | str = "cpu") -> tuple[Batch, torch.Tensor]:
+    """Every operator of some trees, and which of the trees each is from, (B,) int64."""
+    forest = Forest(grown, device)
+    rows = forest.operators()
+    return render_examples(forest, torch.from_numpy(rows), size), torch.from_numpy(forest.tree[rows])
+
+
+def render_examples(forest: Forest, rows: torch.Tensor, size: int) -> Batch:
+    """The examples of some operators of a forest."""
+    inside = disc_mask(size)[0].to(forest.device)
+    values = forest.shade(sphere_normals(size, forest.device)[:, inside][:, None])
+    rows = rows.to(forest.device)
+    left, right, mask = forest.left[rows], forest.right[rows], forest.mask[rows]
+    kinds = torch.from_numpy(forest.kinds).to(forest.device)
+    codes = _TYPE_CODES.to(forest.device)
+
+    def drawn(shaded: Image) -> Image:
+        image = shaded.new_zeros(len(rows), shaded.shape[1], size, size)
+        image[..., inside] = shaded[:, :, 0]
+        return image
+
+    masks = values[mask.clamp(min=0), :1] * (mask >= 0)[:, None, None, None]
+    images = [drawn(shaded) for shaded in (values[rows], values[left], values[right], masks)]
+    # The operators are first in the table, in the order of `OPERATORS`.
+    parent, first, second, masked = images
+    return Batch(parent, first, second, kinds[rows], masked, codes[kinds[left]], codes[kinds[right]])
+
+
+@lru_cache(maxsize=64)
+def plants(style: Style, split: str, seed: int, grove: int) -> tuple[Plant, ...]:
+    """The trees of a grove."""
+    key = int.from_bytes(hashlib.blake2b(f"{style} {split} {seed} {grove}".encode(), digest_size=7).digest(), "big")
+    choices = random.Random(key)
+    outlines = [Outline.of(_structure(style, choices)) for _ in range(GROVE)]
+    return tuple(grow(outlines, split, torch.Generator().manual_seed(key)))
+
+
+def _structure(style: Style, choices: random.Random) -> Structure:
+    """A random structure in words of `base_nodes.BASES`."""
+    own = choices.choice(("realistic", "toon")) if style == "both" else style
+    environment = own == "realistic" and choices.random() < 0.5
+    structure = choices.choice(structures(own, environment, choices.random() < 0.5))
+    if choices.random() >= WIDE_SHARE[own]:
+        return structure
+    if own == "realistic":
+        return _real(structure, choices)
+    drawn = _drawn(structure, choices)
+    return ("mix", drawn, "ink", "outline") if choices.random() < 0.35 else drawn
+
+
+def _real(structure: Structure, choices: random.Random) -> Structure:
+    """With the lights of real pictures: broad ones and coloured ones."""
+    if not isinstance(structure, str):
+        return (structure[0], *[_real(operand, choices) for operand in structure[1:]])
+    if structure == "highlight":
+        light = choices.choice(("broad_highlight", "wide_highlight"))
+        return ("multiply", "albedo", light) if light == "broad_highlight" or choices.random() < 0.5 else light
+    if structure == "rim":
+        return ("multiply", "albedo", "wide_rim") if choices.random() < 0.5 else "wide_rim"
+    return "wide_diffuse" if structure == "diffuse" else structure
+
+
+def _drawn(structure: Structure, choices: random.Random) -> Structure:
+    """As people draw: a plain paint becomes a warm-cool ramp, form and lights get hard edges, lights a colour."""
+    if isinstance(structure, str):
+        if structure == "toon_highlight":
+            return ("multiply", "albedo", "hard_highlight") if choices.random() < 0.4 else "hard_highlight"
+        return "hard_diffuse" if structure == "toon_diffuse" and choices.random() < 0.6 else structure
+    if structure[0] == "multiply" and structure[1] == "albedo" and choices.random() < 0.7:
+        return ("multiply", ("mix", "warm", "cool", "ramp"), *[_drawn(operand, choices) for operand in structure[2:]])
+    return (structure[0], *[_drawn(operand, choices) for operand in structure[1:]])
+
+
+@dataclass(frozen=True)
+class _Blocks(Dataset):
+    """Block n holds the batches n * mixed, n * mixed + 1, ... as one."""
+
+    style: Style
+    split: str
+    size: int
+    batch: int
+    seed: int
+    mixed: int
+    device: torch.device
+
+    def __getitem__(self, block: int) -> Batch:
+        wanted = self.mixed * self.batch
+        groves = -(-wanted // int(GROVE * EXAMPLES_OF_A_TREE))
+        grown = [plant for grove in range(groves) for plant in plants(self.style, self.split, self.seed, block * groves + grove)]
+        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + block) % (1 << 62))
+        forest = Forest(grown, self.device)
+        rows = torch.from_numpy(forest.operators())
+        assert len(rows) >= wanted, f"{len(rows)} examples where {wanted} are needed"
+        return render_examples(forest, rows[torch.randperm(len(rows), generator=generator)[:wanted]], self.size)
+
+
+@dataclass(frozen=True)
+class _Counted:
+    """A `DataLoader` sampler that never ends."""
+
+    first: int
+
+    def __iter__(self) -> Iterator[int]:
+        return count(self.first)
+
+
+def _as_it_is(block: Any) -> Any:
+    return block
+
+
+def _check(style: str, split: str) -> None:
+    if style not in STYLES:
+        raise TreeError(f"unknown style {style!r}{did_you_mean(style, STYLES)}")
+    if split not in SPLITS:
+        raise TreeError(f"unknown split {split!r}{did_you_mean(split, SPLITS)}")
+
+
+assert tuple(BLENDS) == OPERATORS and CODES[: len(OPERATORS)] == OPERATORS
