@@ -98,13 +98,15 @@ def analogy(
     Raises:
         PictureError: a picture cannot be used. TreeError: no component of B changes A, or the blend spaces differ.
     """
+    # All are read before the first is decomposed, so that a bad one is told at once.
+    read = {name: _read(source) for name, source in {"A": a, "B": b, "AB": ab, "P": p, "Q": q}.items()}
+    goal = read.pop("AB")
     seen = {}
-    for name, source in {"A": a, "B": b, "P": p, "Q": q}.items():
+    for name, source in read.items():
         if told is not None and not isinstance(source, Tree):
             told(name)
         seen[name] = _seen(source, preset, seed)
-    goal = _picture(ab)
-    scores = explain(seen["A"], seen["B"].tree, *goal)
+    scores = explain(seen["A"], seen["B"].tree, *_picture(goal))
     if not scores:
         raise TreeError("no component of B changes A, so nothing can be understood from AB")
     which = next(iter(scores))
@@ -128,25 +130,22 @@ def explain(a: Seen, b: Tree, ab: Image, valid: Mask) -> dict[Component, float]:
     return dict(sorted(found.items(), key=lambda entry: -entry[1]))
 
 
-def _picture(source: Source) -> tuple[Image, Mask]:
-    if isinstance(source, Tree):
-        return render(source, sphere_normals(SIZE)), disc_mask(SIZE)
-    sphere = _sphere(source)
-    return sphere.image, sphere.valid
-
-
-def _sphere(source: Source) -> SphereImage:
-    if isinstance(source, SphereImage):
+def _read(source: Source) -> Tree | SphereImage:
+    if isinstance(source, Tree | SphereImage):
         sphere = source
     else:
-        sphere = read_sphere(source) if isinstance(source, str | Path) else sphere_from_array(source)  # type: ignore[arg-type]
-    if sphere.size != SIZE:
+        sphere = read_sphere(source) if isinstance(source, str | Path) else sphere_from_array(source)
+    if isinstance(sphere, SphereImage) and sphere.size != SIZE:
         raise PictureError(f"analogy: expected spheres of {SIZE} pixels, got {sphere.size}")
     return sphere
 
 
-def _seen(source: Source, preset: str, seed: int) -> Seen:
+def _picture(source: Tree | SphereImage) -> tuple[Image, Mask]:
     if isinstance(source, Tree):
-        return Seen(*_picture(source), source)
-    sphere = _sphere(source)
-    return Seen(sphere.image, sphere.valid, decompose(sphere, preset=preset, seed=seed).result().tree)
+        return render(source, sphere_normals(SIZE)), disc_mask(SIZE)
+    return source.image, source.valid
+
+
+def _seen(source: Tree | SphereImage, preset: str, seed: int) -> Seen:
+    tree = source if isinstance(source, Tree) else decompose(source, preset=preset, seed=seed).result().tree
+    return Seen(*_picture(source), tree)

@@ -17,7 +17,7 @@ import torch
 from unshade.components import Component, Lit, Over, Sides, light_component, take_apart
 from unshade.drawing import data_uri
 from unshade.errors import TreeError
-from unshade.labels import escape, outline
+from unshade.labels import escape, key_values, kind_words, outline
 from unshade.nodes import KINDS, Leaf, Node, Operator, Role, Tree, count_values, tint, walk
 from unshade.render import render
 from unshade.sphere import sphere_normals
@@ -49,9 +49,9 @@ class Entry:
 
 
 def parts(trees: Iterable[tuple[str, Tree]]) -> list[Entry]:
-    """The parts of named trees, equal ones once, in the order of `GROUPS`; trees that blend in linear light are refused.
+    """The parts of named trees, equal ones once, in the order of `GROUPS`, those of several leaves first.
 
-    Raises TreeError.
+    Raises TreeError for a tree that blends in linear light.
     """
     found: dict[tuple[str, str], Entry] = {}
     for name, tree in trees:
@@ -63,7 +63,7 @@ def parts(trees: Iterable[tuple[str, Tree]]) -> list[Entry]:
             sources = (*(known.sources if known else ()), f"{name}: {address}")
             found[group, text] = Entry(group, text, node, sources)
     order = list(GROUPS)
-    return sorted(found.values(), key=lambda entry: order.index(entry.group))
+    return sorted(found.values(), key=lambda entry: (order.index(entry.group), isinstance(entry.node, Leaf)))
 
 
 _MASK_HEAD = "mix(albedo((1, 1, 1)), albedo((0, 0, 0)), "
@@ -143,7 +143,7 @@ def _card(entry: Entry, number: int) -> str:
     picture = render(node, sphere_normals(THUMBNAIL)).clamp(0.0, 1.0)
     grey = bool((picture[0] == picture[1]).all() and (picture[0] == picture[2]).all())
     kinds = " ".join(dict.fromkeys(leaf.kind for _, leaf in walk(entry.node) if isinstance(leaf, Leaf)))
-    words = outline(Tree(node)) if entry.group != "mask" else entry.node.kind
+    words = _words(entry.node)
     source = entry.sources[0] + (f" and {len(entry.sources) - 1} more" if len(entry.sources) > 1 else "")
     values = count_values(entry.node)
     image = data_uri(torch.as_tensor(picture[:1] if grey else picture))
@@ -154,6 +154,14 @@ def _card(entry: Entry, number: int) -> str:
         f'<img src="{image}" width="{THUMBNAIL}" height="{THUMBNAIL}" alt="{escape(words)}">'
         f"<b>{escape(words)}</b><span>{escape(source)}</span><i>{values} values</i></button>"
     )
+
+
+def _words(node: Node) -> str:
+    """What a part is, in short: a single leaf with what tells it from others, several counted."""
+    if isinstance(node, Operator):
+        return outline(Tree(node))
+    values = key_values(node, lines=1)
+    return values[0] if node.kind == "albedo" else f"{kind_words(node.kind)}, {', '.join(values)}"
 
 
 def as_json(entries: Iterable[Entry]) -> str:

@@ -18,7 +18,7 @@ from unshade.components import BLACK, WHITE, Use, uses
 from unshade.edit import remove
 from unshade.errors import TreeError
 from unshade.nodes import KINDS, Leaf, Node, Operator, Parameter, Raster, Role, Tree, find, walk
-from unshade.recolor import mean_color
+from unshade.recolor import mean_color, moved_colors
 from unshade.relight import rebuild, turn_between, turned_leaf
 from unshade.render import render
 from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
@@ -28,6 +28,9 @@ SIZE = 48
 
 BETTER = 0.7
 """Another leaf is taken into a match where it leaves less than this share of the squared difference."""
+
+ALIKE = 0.1
+"""Colours this near, up to a scale, are the same colour; another colour takes the change of hue and lightness."""
 
 MOST = 6
 """Most leaves that one leaf is matched with."""
@@ -171,8 +174,10 @@ def _changed_alike(leaf: Leaf, old: Leaf, new: Leaf, same_kind: bool) -> Leaf:
 def _number_alike(parameter: Parameter, value: tuple[float, ...], before: tuple[float, ...], after: tuple[float, ...]) -> np.ndarray:
     own, old, new = (np.asarray(numbers, dtype=float) for numbers in (value, before, after))
     if parameter.type == "color" and own.shape == old.shape:
-        # The scale between the two colours stays, and so does what is left of the difference.
         scale = float(own @ old) / max(float(old @ old), 1e-9)
+        if np.abs(own - scale * old).max() > ALIKE:
+            return np.concatenate([moved_colors(own[k : k + 3], old[k : k + 3].tolist(), new[k : k + 3]) for k in range(0, len(own), 3)])
+        # The same colour up to a scale, which stays, and so does what is left of the difference.
         moved = scale * new + (own - scale * old)
     elif parameter.name in RATIOS and old.shape[0] == 1 and old[0] > 0.0:
         moved = own * (new[0] / old[0])

@@ -19,7 +19,8 @@ from PIL import Image as PILImage
 from unshade.color_profiles import srgb_decode
 from unshade.components import WHITE, Component, Part, join, leaves_below
 from unshade.errors import PictureError
-from unshade.fit.least_squares import fit_least_squares
+from unshade.fit.least_squares import fit_pixels
+from unshade.fit.pixels import Pixels
 from unshade.nodes import Leaf, Node, Operator, Raster, Role, Tree, find, leaf
 from unshade.picture_files import read_picture
 from unshade.relight import lit_leaves, turn, turn_between
@@ -37,10 +38,10 @@ GLOSSY_HEIGHT = 32
 """Rows of the reflection of a highlight's width."""
 
 SIZE = 64
-"""Pixels of the matt sphere that the form is fitted to."""
+"""Pixels of the spheres whose brightness is compared."""
 
-LIGHTS = 4
-"""Broad lights that the form is fitted with."""
+FORM_HEIGHT = 16
+"""Rows of directions that the form is fitted at; light on a matt surface changes slowly."""
 
 
 @dataclass(frozen=True)
@@ -129,15 +130,28 @@ def _form(tree: Tree, surroundings: Surroundings, exposure: float, linear: bool)
     old = component(tree, Component.DIFFUSE)
     shown = render(old, normals) if old is not None else torch.full((3, SIZE, SIZE), 0.7)
     wanted = float((shown if linear else decode(shown))[:, inside[0]].mean()) * exposure
-    shed = surroundings.shed(normals)
-    shed = (shed * (wanted / max(float(shed[:, inside[0]].mean()), 1e-12))).clamp(0.0, 1.0)
-    target = shed if linear else srgb_encode(shed)
-    lights: list[Node] = [Leaf("albedo", (tuple(target[:, inside[0]].amin(-1).tolist()),))]
+    seen = surroundings.shed(normals)[:, inside[0]]
+    scale = wanted / max(float(seen.mean()), 1e-12)
+    for _ in range(20):  # what is clipped has to be made up for
+        scale *= wanted / max(float((seen * scale).clamp(max=1.0).mean()), 1e-12)
+    # Fitted to the side away from the viewer as well, so that the form is right when it is turned.
+    shed = (surroundings.shed(directions(FORM_HEIGHT)) * scale).clamp(0.0, 1.0)
+    target = (shed if linear else srgb_encode(shed)).reshape(3, -1)
+    weight = _solid_angles(FORM_HEIGHT)
+    pixels = Pixels(directions(FORM_HEIGHT).reshape(3, -1), target, weight / weight.sum())
+    lights: list[Node] = [Leaf("albedo", (tuple((0.5 * target.amin(-1)).tolist()),))]
+    color = target.mean(-1).mul(0.4).tolist()
     best = surroundings.brightest
-    for direction in (best, (0.0, 0.8, 0.6), (0.0, -0.8, 0.6), (-best[0], 0.0, 0.5))[:LIGHTS]:
-        color = target[:, inside[0]].mean(-1).mul(0.5).tolist()
-        lights.append(Operator("multiply", (leaf("albedo", color=color), leaf("highlight", direction=direction, sharpness=0.8))))
-    return fit_least_squares(target, inside, Operator("screen", tuple(lights)), count=2000).root
+    for direction in (
+        best,
+        (0.0, 1.0, 0.0),
+        (0.0, -1.0, 0.0),
+        (-best[0], 0.1, -best[2]),
+        (best[2], 0.1, -best[0]),
+        (-best[2], 0.1, best[0]),
+    ):
+        lights.append(Operator("multiply", (leaf("albedo", color=color), leaf("highlight", direction=direction, sharpness=0.5))))
+    return fit_pixels(pixels, Operator("screen", tuple(lights)), steps=60).root
 
 
 def _reflection(tree: Tree, surroundings: Surroundings, exposure: float, linear: bool) -> Node | None:

@@ -171,9 +171,10 @@ def write_turntable(path: Path, pictures: Iterator[Image], fps: float = 24.0) ->
 
 
 def _write_gif(path: Path, arrays: list[NDArray[np.uint8]], fps: float) -> None:
-    # One palette for all frames: colours that come and go with the frame would flicker.
-    step = max(1, len(arrays) // 12)
-    palette = PILImage.fromarray(np.concatenate(arrays[::step])).quantize(255, method=PILImage.Quantize.MEDIANCUT)
+    # One palette for all frames, or colours would flicker; of the colours that occur, each once, or large dark areas would take it.
+    several = np.concatenate([array.reshape(-1, 3) for array in arrays[:: max(1, len(arrays) // 12)]])
+    colors = np.unique(several & 0xF8, axis=0) | 0x04
+    palette = PILImage.fromarray(colors[None]).quantize(255, method=PILImage.Quantize.MEDIANCUT, kmeans=2)
     frames = [PILImage.fromarray(array).quantize(palette=palette, dither=PILImage.Dither.FLOYDSTEINBERG) for array in arrays]
     # A GIF counts in hundredths of a second, and programs play less than two of them slowly.
     duration = max(20, 10 * round(100.0 / fps))

@@ -58,7 +58,10 @@ def _recolored(tree: Tree, chance: np.random.Generator, strength: float) -> Tree
     """The paint's mean with another hue, colourfulness and lightness."""
     paint = component(tree, Component.ALBEDO)
     hue, chroma, light = chance.uniform(-1.0, 1.0, 3)
-    if paint is None or all(use.component is not Component.ALBEDO or use.over for use in uses(tree.root).values()):
+    known = uses(tree.root)
+    painted = [leaf for a, leaf in tree.walk() if a in known and known[a].component is Component.ALBEDO and not known[a].over]
+    painted = [leaf for leaf in painted if KINDS[leaf.kind].role is Role.PAINT]
+    if paint is None or not painted:
         return tree
     mean = np.asarray(mean_color(paint))
     encoded = srgb_encode(torch.from_numpy(mean)).numpy() if tree.blend_space == "linear" else mean
