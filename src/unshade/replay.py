@@ -176,7 +176,9 @@ def _number_alike(parameter: Parameter, value: tuple[float, ...], before: tuple[
     if parameter.type == "color" and own.shape == old.shape:
         scale = float(own @ old) / max(float(old @ old), 1e-9)
         if np.abs(own - scale * old).max() > ALIKE:
-            return np.concatenate([moved_colors(own[k : k + 3], old[k : k + 3].tolist(), new[k : k + 3]) for k in range(0, len(own), 3)])
+            return np.concatenate(
+                [moved_colors(own[k : k + 3], old[k : k + 3].tolist(), new[k : k + 3].tolist()) for k in range(0, len(own), 3)]
+            )
         # The same colour up to a scale, which stays, and so does what is left of the difference.
         moved = scale * new + (own - scale * old)
     elif parameter.name in RATIOS and old.shape[0] == 1 and old[0] > 0.0:

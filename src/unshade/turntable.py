@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -181,25 +181,30 @@ def _write_gif(path: Path, arrays: list[NDArray[np.uint8]], fps: float) -> None:
     frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0, optimize=False, disposal=1)
 
 
-def _encoder(path: Path) -> Any:
+def _encoder(path: Path) -> str:
+    """The ffmpeg that comes with the library."""
     try:
         import imageio_ffmpeg
     except ImportError:
         raise MissingExtraError(f"{path}: MP4 needs the imageio-ffmpeg library; install it with: pip install 'unshade[video]'") from None
-    return imageio_ffmpeg
+    try:
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    except RuntimeError as error:
+        raise MissingExtraError(f"{path}: MP4 needs ffmpeg, which imageio-ffmpeg did not bring ({str(error).splitlines()[0]})") from None
 
 
-def _write_mp4(encoder: Any, path: Path, arrays: list[NDArray[np.uint8]], fps: float) -> None:
+def _write_mp4(encoder: str, path: Path, arrays: list[NDArray[np.uint8]], fps: float) -> None:
     # H.264 in its common form has colour at half resolution, so both sides must be even.
     even = [np.ascontiguousarray(array[: array.shape[0] // 2 * 2, : array.shape[1] // 2 * 2]) for array in arrays]
     height, width = even[0].shape[:2]
-    try:
-        writer = encoder.write_frames(
-            str(path), (width, height), fps=fps, codec="libx264", quality=8, macro_block_size=2, output_params=["-f", "mp4"]
-        )
-        writer.send(None)
-        for array in even:
-            writer.send(array)
-        writer.close()
-    except (OSError, RuntimeError) as error:
-        raise OutputError(f"{path}: the video cannot be written ({str(error).splitlines()[0]})") from None
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
+    target = ["-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(path)]
+    done = subprocess.run(
+        [encoder, "-y", "-loglevel", "error", *source, *target],
+        input=b"".join(array.tobytes() for array in even),
+        capture_output=True,
+        check=False,
+    )
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {done.returncode}"]
+        raise OutputError(f"{path}: the video cannot be written ({said[-1]})")
