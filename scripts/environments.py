@@ -1,7 +1,8 @@
 """Shrink lat-long HDRIs to what the package ships: `python scripts/environments.py FOLDER`.
 
-FOLDER holds the EXR files that `src/unshade/hdri/sources.json` names, NAME.exr (that file also says where they come
-from). Each becomes 128 x 64 scene-linear numbers of half precision, scaled to a mean of 1.
+FOLDER holds NAME.exr for each environment of `src/unshade/hdri/sources.json`, which says where the files come from; those of
+the npm package are modules with the EXR in base64. Each becomes 128 x 64 scene-linear numbers of half precision, scaled to a
+mean of 1.
 """
 
 import json

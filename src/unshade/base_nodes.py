@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 
-from unshade.environments import TEST, names, panoramas, raster, versions
+from unshade.environments import raster, versions
 from unshade.nodes import KINDS, Leaf, Raster, Role
 from unshade.sampler import cut_radius
 
@@ -145,8 +146,9 @@ def half_of(leaf: Leaf) -> str | None:
     return SPLITS[int(_is_test(torch.tensor([first], dtype=torch.float64), leaf.role))]
 
 
+@lru_cache(maxsize=1)
 def _halves_of_environments() -> dict[bytes, str]:
-    return {raster(split, version).data: split for split in SPLITS for version in range(len(panoramas(split)))}
+    return {raster(split, version).data: split for split in SPLITS for version in range(len(versions(split)))}
 
 
 def _is_test(points: torch.Tensor, role: Role) -> torch.Tensor:
@@ -203,6 +205,3 @@ def _released_radii(count: int, generator: torch.Generator) -> torch.Tensor:
     parts = (Range(0.5, 0.8), Range(30.0, 90.0), Range(0.1, 0.5))
     amplitudes, sharpnesses, thresholds = (part.draw(count, generator).tolist() for part in parts)
     return torch.tensor([cut_radius(*cut) for cut in zip(amplitudes, sharpnesses, thresholds, strict=True)], dtype=torch.float64)
-
-
-__all__ = ["BASES", "SPLITS", "TEST", "Base", "Range", "base_leaf", "draw", "half_of", "names"]

@@ -6,11 +6,13 @@ leaves something of the paint below. So each environment comes in a few versions
 
 from __future__ import annotations
 
+import json
 import math
 from functools import lru_cache
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from safetensors.torch import load_file
 
 from unshade.nodes import Raster
@@ -21,9 +23,6 @@ FOLDER = Path(__file__).parent / "hdri"
 SOURCES = FOLDER / "sources.json"
 STORED = FOLDER / "environments.safetensors"
 
-TEST = frozenset({"apartment", "dawn", "forest", "studio", "sunset", "warehouse"})
-"""Environments of the test half; indoors and outdoors, day and evening are in both halves."""
-
 EXPOSURES = (0.02, 0.045, 0.1, 0.2)
 """What the mean of an environment becomes, scene-linear: from a coat of varnish to dull metal."""
 
@@ -33,11 +32,14 @@ SHARPNESSES = (None, 60.0, 12.0)
 BLURRED_HEIGHT = 32
 
 
+@lru_cache(maxsize=2)
 def names(split: str) -> tuple[str, ...]:
     """The environments of a half, train or test."""
-    return tuple(name for name in sorted(load_file(STORED)) if (name in TEST) == (split == "test"))
+    listed = json.loads(SOURCES.read_text(encoding="utf-8"))["environments"]
+    return tuple(entry["name"] for entry in listed if entry["half"] == split)
 
 
+@lru_cache(maxsize=2)
 def versions(split: str) -> tuple[tuple[str, float, float | None], ...]:
     """(name, exposure, sharpness of the blur) of every version of a half's environments, in the order of `panoramas`."""
     return tuple((name, exposure, sharpness) for name in names(split) for sharpness in SHARPNESSES for exposure in EXPOSURES)
@@ -47,13 +49,10 @@ def versions(split: str) -> tuple[tuple[str, float, float | None], ...]:
 def panoramas(split: str) -> Image:
     """The versions of a half, (V, 3, 64, 128) display-encoded in [0, 1] and rounded to 16 bits."""
     stored = load_file(STORED)
-    pictures = []
-    for name in names(split):
-        light = stored[name].float()
-        for sharpness in SHARPNESSES:
-            shown = light if sharpness is None else blurred(light, sharpness)
-            pictures += [srgb_encode((exposure * shown).clamp(0.0, 1.0)) for exposure in EXPOSURES]
-    return (torch.stack(pictures) * 65535.0).round() / 65535.0
+    light = torch.stack([stored[name].float() for name in names(split)])
+    shown = torch.stack([light if sharpness is None else blurred(light, sharpness) for sharpness in SHARPNESSES], dim=1)
+    exposed = shown[:, :, None] * torch.tensor(EXPOSURES).view(-1, 1, 1, 1)
+    return (srgb_encode(exposed.clamp(0.0, 1.0)) * 65535.0).round().flatten(0, 2) / 65535.0
 
 
 def raster(split: str, version: int) -> Raster:
@@ -62,16 +61,17 @@ def raster(split: str, version: int) -> Raster:
 
 
 def blurred(light: Image, sharpness: float) -> Image:
-    """An environment seen in a rough coat: averaged with the weights ``exp(-sharpness * |a - b|^2)`` of directions a and b."""
+    """Environments (K, 3, h, w) seen in a rough coat: averaged with weights ``exp(-sharpness * |a - b|^2)`` of directions a and b."""
     height, width = light.shape[-2:]
-    small = torch.nn.functional.avg_pool2d(light[None], height // BLURRED_HEIGHT)[0]
+    small = F.avg_pool2d(light, height // BLURRED_HEIGHT)
     directions, areas = _directions(BLURRED_HEIGHT)
     weights = torch.exp(-2.0 * sharpness * (1.0 - directions @ directions.T)) * areas
-    spread = small.flatten(1) @ (weights / weights.sum(1, keepdim=True)).T
+    spread = (small.flatten(2) @ (weights / weights.sum(1, keepdim=True)).T).view_as(small)
     # Wrapped round before it is enlarged, so that no seam shows.
-    wrapped = torch.cat([spread.view_as(small)] * 3, dim=-1)[None]
-    large = torch.nn.functional.interpolate(wrapped, size=(height, 3 * width), mode="bilinear", align_corners=False)[0]
-    return large[..., width : 2 * width]
+    wrapped = torch.cat([spread[..., -2:], spread, spread[..., :2]], dim=-1)
+    scale = height // BLURRED_HEIGHT
+    large = F.interpolate(wrapped, scale_factor=scale, mode="bilinear", align_corners=False)
+    return large[..., 2 * scale : 2 * scale + width]
 
 
 def _directions(height: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -50,8 +50,8 @@ MIXED_BATCHES = 16
 MIXED_NUMBERS = 1 << 25
 """Pixels times examples that are shuffled together, at most."""
 
-EXAMPLES_OF_A_TREE = 5.0
-"""Operators of a tree, a little fewer than on the average."""
+EXAMPLES_OF_A_TREE = 4
+"""Operators of a tree, fewer than on the average, so that a grove or more has them for certain."""
 
 _TYPE_CODES = torch.tensor(
     [TYPES.index("environment" if kind == "environment_map" else kind) if kind in (*TYPES, "environment_map") else 0 for kind in CODES]
@@ -228,7 +228,7 @@ class _Blocks(Dataset):
 
     def __getitem__(self, block: int) -> Batch:
         wanted = self.mixed * self.batch
-        groves = -(-wanted // int(GROVE * EXAMPLES_OF_A_TREE))
+        groves = -(-wanted // (GROVE * EXAMPLES_OF_A_TREE))
         grown = [plant for grove in range(groves) for plant in plants(self.style, self.split, self.seed, block * groves + grove)]
         generator = torch.Generator().manual_seed((self.seed * 1_000_003 + block) % (1 << 62))
         forest = Forest(grown, self.device)
