@@ -64,14 +64,14 @@ def _section(name: str, folder: Path) -> str:
     path = weights.file_of(name, folder)
     card = weights.read_card(path)
     finished = "" if card["steps"] >= card["of"] else f" of {card['of']:,}: not finished"
+    made = f"{card['hours']:.1f} hours on {card['hardware']}, precision {card['precision']}, PyTorch {card['torch']}"
     lines = [
         f"## {TITLES[name]}",
         "",
         f"`{path.name}`, {path.stat().st_size / 2**20:.1f} MiB, configuration `{card['config']}`.",
         "",
         f"- Data: {card['data']}; {card['examples']:,} examples.",
-        f"- Training: {card['steps']:,} steps{finished}, {card['hours']:.1f} hours on {card['hardware']}, precision {card['precision']}, "
-        f"PyTorch {card['torch']}.",
+        f"- Training: {card['steps']:,} steps{finished}, {made}.",
         "",
         *_table(card["figures"]),
     ]

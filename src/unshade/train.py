@@ -6,7 +6,6 @@ DIR/weights/TASK.safetensors (what it is for). Everything random in a step comes
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import platform
@@ -29,7 +28,7 @@ from unshade.tasks import HeadsTask, PriorTask, Task, VQVAETask
 from unshade.training_log import Log
 
 if TYPE_CHECKING:
-    from unshade.synthesis import Batch
+    from unshade.synthesis import Batch, Style
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (VQVAETask, PriorTask, HeadsTask)}
 """Everything that can be trained, each after those whose weights it needs."""
@@ -52,7 +51,7 @@ class Run:
     config: Config
     folder: Path
     seed: int = 0
-    style: str = "both"
+    style: Style = "both"
     precision: str = "auto"
     """float32, bfloat16, or auto: bfloat16 on a GPU that has it."""
     workers: int = 0
@@ -165,23 +164,22 @@ def _batches(run: Run, step: int, rank: int) -> Iterator[Batch]:
     training = run.training
     seed = run.seed + 7_919 * rank
     stream = batches(run.style, "train", size=run.config.size, batch=training.batch, seed=seed, start=step, workers=run.workers)
-    with contextlib.closing(stream):
-        for _ in range(step, training.steps):
-            yield next(stream)
+    for _ in range(step, training.steps):
+        yield next(stream)
 
 
 def _look(run: Run, task: Task, model: nn.Module, position: Position, log: Log) -> dict[str, float]:
     """Figures of unseen nodes, a sheet of pictures, and the weights as they are now."""
-    from unshade.synthesis import STYLES, batches
+    from unshade.synthesis import batches
 
     count = EVALUATED_LAST if position.step == run.training.steps else EVALUATED
     figures: dict[str, float] = {}
     model.eval()
     with torch.no_grad():
-        for style in STYLES if run.style == "both" else (run.style,):
+        styles: tuple[Style, ...] = ("realistic", "toon") if run.style == "both" else (run.style,)
+        for style in styles:
             stream = batches(style, "test", size=run.config.size, batch=EVALUATION_BATCH, seed=run.seed)
-            with contextlib.closing(stream):
-                found = [next(stream).to(task.device) for _ in range(count)]
+            found = [next(stream).to(task.device) for _ in range(count)]
             figures |= {f"{style}_{key}": value for key, value in task.evaluate(model, found).items()}
             drawn = task.pictures(model, found[0]).cpu()
             path = run.folder / run.task / "pictures" / f"{position.step:07d}-{style}.png"

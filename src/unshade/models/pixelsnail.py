@@ -209,7 +209,7 @@ class PixelSNAIL(nn.Module):
         for block in self.blocks:
             assert isinstance(block, Block)
             for layer in [*block.layers, block.join]:
-                layer.begin(cache, condition)  # type: ignore[operator]
+                layer.begin(cache, condition)
             block.attention.begin(cache, count, size * size)
         drawn = condition.new_zeros(count, size, size, dtype=torch.int64)
         for position in range(size * size):

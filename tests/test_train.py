@@ -1,0 +1,250 @@
+"""The training loop: losses fall, a run that was stopped or killed ends as one that was not, and mistakes get one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import safetensors.torch
+import torch
+from click.testing import CliRunner
+from torch import Tensor
+
+from unshade import model_card, processes, train
+from unshade.checkpoint import CheckpointError
+from unshade.cli import cli
+from unshade.cli_train import MODELS
+from unshade.errors import MissingWeightsError
+from unshade.models import weights
+from unshade.models.config import Config, TrainingConfig, find
+from unshade.tasks import overlap, psnr
+from unshade.train import Run, learning_rate
+
+
+def config(steps: int, batch: int = 4, rate: float = 3e-3) -> Config:
+    tiny = find("tiny")
+    return dataclasses.replace(tiny, training={name: TrainingConfig(steps, batch, rate, warmup=3) for name in tiny.training})
+
+
+def run_of(folder: Path, task: str = "vqvae", steps: int = 8, **options: Any) -> Run:
+    return Run(task, config(steps), folder, **{"report_every": 1, "evaluate_every": 4, **options})
+
+
+def finish(run: Run) -> list[train.Progress]:
+    return [progress for progress in train.train(run) if progress.figures]
+
+
+def lines(run: Run) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (run.folder / run.task / "log.jsonl").read_text().splitlines()]
+
+
+def tensors(run: Run) -> dict[str, Tensor]:
+    return safetensors.torch.load_file(run.state)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_evaluated() -> Iterator[None]:
+    """One batch of each style says enough here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "EVALUATED", 1)
+        patch.setattr(train, "EVALUATED_LAST", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[train.Progress]]:
+    """Every model trained for a few steps, one after the other, as `unshade train all` does."""
+    folder = tmp_path_factory.mktemp("trained")
+    steps = {"vqvae": 100, "prior": 40, "heads": 60}
+    return {
+        task: finish(Run(task, config(steps[task], 8, 1e-2 if task == "vqvae" else 3e-3), folder, report_every=10, evaluate_every=1000))
+        for task in MODELS
+    }
+
+
+@pytest.mark.parametrize("task", MODELS)
+def test_the_loss_falls(task: str, trained: dict[str, list[train.Progress]]) -> None:
+    losses = [progress.loss for progress in trained[task]]
+    assert losses[-1] < 0.8 * losses[0]
+    figures = trained[task][-1].test
+    assert {name.partition("_")[0] for name in figures} == {"realistic", "toon"}
+    if task == "vqvae":
+        assert figures["realistic_bottom_codes_used"] >= 8
+        assert figures["toon_psnr"] > 12.0
+
+
+@pytest.mark.parametrize("task", MODELS)
+def test_resume_equals_no_interruption(task: str, tmp_path: Path) -> None:
+    """Bit for bit, although the second run was killed between two saves."""
+    whole, cut = run_of(tmp_path / "whole", task), run_of(tmp_path / "cut", task)
+    if task == "prior":
+        for run in (whole, cut):
+            finish(run_of(run.folder, "vqvae", 4))
+    finish(whole)
+    for progress in train.train(cut):
+        if progress.step == 6:
+            break
+    assert [line["step"] for line in lines(cut) if line["split"] == "train"] == [1, 2, 3, 4, 5, 6]
+    seen = [progress.step for progress in train.train(cut)]
+    assert seen == [4, 5, 6, 7, 8]
+    assert lines(cut) == lines(whole)
+    first, second = tensors(whole), tensors(cut)
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[key], second[key]) for key in first)
+
+
+def test_ctrl_c_ends_the_step_and_saves(tmp_path: Path) -> None:
+    run = run_of(tmp_path, steps=8)
+    before = signal.getsignal(signal.SIGINT)
+    seen = []
+    with pytest.raises(KeyboardInterrupt):
+        for progress in train.train(run):
+            seen.append(progress.step)
+            if progress.step == 2:
+                signal.raise_signal(signal.SIGINT)
+    assert seen == [0, 1, 2]
+    assert signal.getsignal(signal.SIGINT) is before
+    assert next(train.train(run)).step == 2
+
+
+def test_more_steps_may_be_asked_for_later(tmp_path: Path) -> None:
+    finish(run_of(tmp_path, steps=2))
+    assert [progress.step for progress in finish(run_of(tmp_path, steps=4))] == [3, 4]
+    assert finish(run_of(tmp_path, steps=4)) == []
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"style": "toon"}, {"precision": "bfloat16"}, {"batch": 5}])
+def test_a_run_goes_on_only_as_it_began(change: dict[str, Any], tmp_path: Path) -> None:
+    finish(run_of(tmp_path, steps=1))
+    run = Run("vqvae", config(2, change.pop("batch", 4)), tmp_path, **change)
+    with pytest.raises(CheckpointError, match="choose another folder") as caught:
+        finish(run)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("data", [b"", b"state", "cut"])
+def test_a_damaged_state_is_one_line(data: bytes | str, tmp_path: Path) -> None:
+    run = run_of(tmp_path, steps=1)
+    finish(run)
+    run.state.write_bytes(run.state.read_bytes()[:-9] if isinstance(data, str) else data)
+    with pytest.raises(CheckpointError, match=r"damaged.*delete it") as caught:
+        finish(run_of(tmp_path, steps=2))
+    assert "\n" not in str(caught.value)
+
+
+def test_prior_needs_a_vqvae_of_its_configuration(tmp_path: Path) -> None:
+    with pytest.raises(MissingWeightsError, match="vqvae"):
+        finish(run_of(tmp_path, "prior"))
+    finish(run_of(tmp_path, steps=1))
+    other = dataclasses.replace(config(2), name="other", vqvae=dataclasses.replace(config(2).vqvae, codes=8))
+    with pytest.raises(train.UnshadeError, match="does not fit 'other'"):
+        finish(Run("prior", other, tmp_path))
+
+
+def test_without_tensorboard_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    run = run_of(tmp_path, steps=1)
+    notes = next(train.train(run)).notes
+    assert any("unshade[train]" in note for note in notes)
+
+
+def test_what_a_run_leaves(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    run = run_of(tmp_path, steps=2, evaluate_every=2)
+    finish(run)
+    names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert {"vqvae/pictures/0000002-toon.png", "vqvae/log.jsonl", "weights/vqvae.safetensors"} <= names
+    assert any(name.startswith("vqvae/tensorboard/events") for name in names)
+    card = weights.read_card(weights.file_of("vqvae", run.weights))
+    assert (card["steps"], card["examples"], card["config"]) == (2, 8, "tiny")
+
+
+def test_a_run_changes_nothing_around_it(tmp_path: Path) -> None:
+    torch.manual_seed(3)
+    before = torch.random.get_rng_state()
+    finish(run_of(tmp_path, steps=1))
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_learning_rate_rises_holds_and_falls() -> None:
+    training = TrainingConfig(steps=100, batch=1, learning_rate=1.0, warmup=10, decay=0.5)
+    rates = [learning_rate(training, step) for step in range(100)]
+    assert rates[0] == 0.1
+    assert rates[10:50] == [1.0] * 40
+    assert 0.0 < rates[99] < 0.05
+
+
+def test_figures_are_right() -> None:
+    from unshade.metrics import psnr as reference
+
+    a, b = torch.rand(2, 3, 32, 32), torch.rand(2, 3, 32, 32)
+    assert psnr(a, b).tolist() == pytest.approx([reference(x, y) for x, y in zip(a, b, strict=True)], rel=1e-4)
+    half = torch.zeros(2, 1, 8, 8, dtype=torch.bool)
+    half[0, :, :, :4] = True
+    assert overlap(half, torch.ones_like(half)).tolist() == pytest.approx([0.5, 0.0])
+    assert overlap(half, half).tolist() == [1.0, 1.0]
+
+
+def test_precision_is_known() -> None:
+    assert processes.precision("auto", torch.device("cpu")) == torch.float32
+    with pytest.raises(processes.DeviceError, match="float16"):
+        processes.precision("float16", torch.device("cpu"))
+
+
+def test_mixed_precision_trains(tmp_path: Path) -> None:
+    progress = finish(run_of(tmp_path, steps=4, precision="bfloat16"))
+    assert all(torch.isfinite(torch.tensor(one.loss)) for one in progress)
+
+
+def test_the_command_trains_all(tmp_path: Path) -> None:
+    done = CliRunner().invoke(cli, ["train", "all", "--config", "tiny", "--steps", "2", "-o", str(tmp_path), "--json"])
+    assert done.exit_code == 0, done.output
+    reports = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [report["task"] for report in reports] == list(MODELS)
+    page = (tmp_path / "weights" / "model-card.md").read_text(encoding="utf-8")
+    assert all(title in page for title in model_card.TITLES.values())
+    assert "–" not in page.partition("# Model card")[2].replace("true – ", "")
+    assert weights.available(tmp_path / "weights")
+
+
+def test_the_commands_mistakes(tmp_path: Path) -> None:
+    from unshade.cli import run
+
+    assert run(["train", "vqvae", "--config", "smal", "-o", str(tmp_path)]) == 2
+    assert run(["train", "prior", "--config", "tiny", "-o", str(tmp_path)]) == 6
+    (tmp_path / "file").write_text("")
+    assert run(["train", "vqvae", "--config", "tiny", "-o", str(tmp_path / "file")]) == 5
+
+
+def test_the_command_knows_every_task() -> None:
+    assert set(MODELS) <= set(train.TASKS)
+
+
+@pytest.mark.slow
+def test_two_processes_learn_together(tmp_path: Path) -> None:
+    """What torchrun sets is set by hand. Both take the same steps, so the state of the first is that of both."""
+    command = [sys.executable, "-m", "unshade", "train", "vqvae", "--config", "tiny", "--steps", "3", "-o", str(tmp_path), "--json"]
+    base = {**os.environ, "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(20_000 + os.getpid() % 20_000)}
+    started = [
+        subprocess.Popen(command, env={**base, "RANK": str(rank), "LOCAL_RANK": str(rank)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        for rank in range(2)
+    ]
+    outputs = [process.communicate(timeout=120) for process in started]
+    assert [process.returncode for process in started] == [0, 0], outputs
+    assert outputs[0][0].count(b"\n") == 1
+    assert outputs[1][0] == b""
+    card = weights.read_card(weights.file_of("vqvae", tmp_path / "weights"))
+    assert card["examples"] == 3 * 4 * 2
+
+
+def test_the_model_card_is_of_the_weights_that_ship() -> None:
+    path = Path(__file__).resolve().parent.parent / "docs" / "model-card.md"
+    assert path.read_text(encoding="utf-8") == model_card.page(weights.FOLDER)
