@@ -90,7 +90,7 @@ def precision(wanted: str, device: torch.device) -> torch.dtype:
 def seeded(seed: int, step: int, rank: int = 0) -> Iterator[None]:
     """Inside, torch draws what belongs to this step and process alone; outside, nothing has happened."""
     with torch.random.fork_rng(devices=range(torch.cuda.device_count()) if torch.cuda.is_available() else []):
-        torch.manual_seed((seed * 1_000_003 + step) * 4_099 + rank)
+        torch.manual_seed(((seed * 1_000_003 + step) * 4_099 + rank) % (1 << 63))
         yield
 
 
