@@ -33,6 +33,7 @@ from unshade.components import Component, is_paint
 from unshade.decompose import decompose
 from unshade.edit import remove, rename
 from unshade.edit_script import EditScript
+from unshade.errors import TreeError
 from unshade.grammar import same_structure, sample
 from unshade.metrics import psnr
 from unshade.nodes import Leaf, Node, Operator, Tree
@@ -164,7 +165,11 @@ def measure_edits(known: list[Known]) -> list[dict[str, Any]]:
     turn_by_turn = [(k, pair) for round_ in range(PAIRS) for k, queue in enumerate(queues) for pair in queue[round_ : round_ + 1]]
     for k, (what, changed) in turn_by_turn[:PAIRS]:
         one = known[k]
-        again = replay(one.truth, changed, one.found)
+        fault = None
+        try:
+            again = replay(one.truth, changed, one.found)
+        except TreeError as error:  # counted as if nothing had been edited
+            again, fault = one.found, str(error)
         rows.append(
             {
                 "tree": one.name,
@@ -172,6 +177,7 @@ def measure_edits(known: list[Known]) -> list[dict[str, Any]]:
                 "psnr": decibels(again, changed),
                 "before": decibels(one.found, one.truth),
                 "unedited": decibels(one.found, changed),
+                **({"failed": fault} if fault else {}),
             }
         )
     return rows

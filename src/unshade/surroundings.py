@@ -2,7 +2,8 @@
 
 The environment gives the tree three things. Its form becomes what the environment sheds on a matt white sphere, fitted by a
 few broad coloured lights, so that the result can still be edited and turned. Its highlights and reflections become a
-reflection of the environment (an `environment_map`), as blurred as its highlights were wide and as bright as they were. Its
+reflection of the environment (an `environment_map`): of a tree with highlights as blurred as they were wide, as bright as they
+were, and only of what stands out; of a tree with an environment sharp and whole, on the average as bright. Its
 rim turns to where the environment is brightest. Brightness is kept: the new form is on the average as bright as the old one.
 """
 
@@ -42,6 +43,10 @@ SIZE = 64
 
 FORM_HEIGHT = 16
 """Rows of directions that the form is fitted at; light on a matt surface changes slowly."""
+
+
+SURROUND = 0.8
+"""Share of all directions that a highlight stands out from."""
 
 
 @dataclass(frozen=True)
@@ -169,11 +174,24 @@ def _reflection(tree: Tree, surroundings: Surroundings, exposure: float, linear:
         widths = sorted(_sharpness(spot) for _, spot in leaves_below(Part("", old)) if spot.role is Role.HIGHLIGHT)
         # A light of the mirrored world moves twice as fast as the normal that mirrors it.
         mirrored = surroundings.blurred(widths[len(widths) // 2] / 4.0, GLOSSY_HEIGHT)
+        mirrored = _standing_out(mirrored)
         shown = render(old, normals)[:, inside]
         peak = shown if linear else decode(shown)
         scale = float(peak.amax()) / max(float(mirrored.amax()), 1e-12)
     light = (mirrored * scale * exposure).clamp(0.0, 1.0)
     return leaf("environment_map", pixels=Raster.from_array(light if linear else srgb_encode(light)))
+
+
+def _standing_out(light: Image) -> Image:
+    """What a highlight is of a reflection (3, H, 2 H): the light over that of `SURROUND` of the directions, in its own colour.
+
+    What is mirrored around a highlight is no part of it; paint and form hold it already.
+    """
+    brightness = light.mean(0)
+    order = brightness.flatten().argsort()
+    below = _solid_angles(light.shape[1])[order].cumsum(0)
+    floor = brightness.flatten()[order[int((below < SURROUND * float(below[-1])).sum())]]
+    return light * ((brightness - floor).clamp(min=0.0) / brightness.clamp(min=1e-12))
 
 
 def _sharpness(spot: Leaf) -> float:
