@@ -22,6 +22,8 @@ def reference() -> str:
         command = cli.resolve_command(context, [name])[1]
         assert command is not None
         commands.append((f"unshade {name}", command))
+        below = command.commands if isinstance(command, click.Group) else {}
+        commands += [(f"unshade {name} {verb}", below[verb]) for verb in sorted(below)]
     return HEAD + "".join(f"\n## {path}\n\n```text\n{help_text(path, command)}\n```\n" for path, command in commands)
 
 

@@ -136,7 +136,11 @@ def test_documented_commands_exist(document: Path) -> None:
     for block in re.findall(r"^```sh\n(.*?)^```", document.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
         for verb, rest in re.findall(r"^\s*unshade ([a-z]+)(.*)$", block, re.MULTILINE):
             assert verb in cli.commands, f"{document.name}: there is no `unshade {verb}`"
-            known = {option for parameter in cli.commands[verb].params for option in parameter.opts} | {"--help"}
+            command = cli.commands[verb]
+            if isinstance(command, click.Group) and rest.split()[:1]:
+                assert rest.split()[0] in command.commands, f"{document.name}: there is no `unshade {verb} {rest.split()[0]}`"
+                command = command.commands[rest.split()[0]]
+            known = {option for parameter in command.params for option in parameter.opts} | {"--help"}
             for option in re.findall(r"(?<=\s)--?[a-z][a-z-]*", rest.partition("#")[0]):
                 assert option in known, f"{document.name}: `unshade {verb}` has no {option}"
 

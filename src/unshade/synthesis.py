@@ -53,10 +53,6 @@ MIXED_NUMBERS = 1 << 25
 EXAMPLES_OF_A_TREE = 4
 """Operators of a tree, fewer than on the average, so that a grove or more has them for certain."""
 
-_TYPE_CODES = torch.tensor(
-    [TYPES.index("environment" if kind == "environment_map" else kind) if kind in (*TYPES, "environment_map") else 0 for kind in CODES]
-)
-
 
 @dataclass(frozen=True)
 class Batch:
@@ -155,7 +151,7 @@ def render_examples(forest: Forest, rows: torch.Tensor, size: int) -> Batch:
     rows = rows.to(forest.device)
     left, right, mask = forest.left[rows], forest.right[rows], forest.mask[rows]
     kinds = torch.from_numpy(forest.kinds).to(forest.device)
-    codes = _TYPE_CODES.to(forest.device)
+    codes = type_codes().to(forest.device)
 
     def drawn(shaded: Image) -> Image:
         image = shaded.new_zeros(len(rows), shaded.shape[1], size, size)
@@ -167,6 +163,13 @@ def render_examples(forest: Forest, rows: torch.Tensor, size: int) -> Batch:
     # The operators are first in the table, in the order of `OPERATORS`.
     parent, first, second, masked = images
     return Batch(parent, first, second, kinds[rows], masked, codes[kinds[left]], codes[kinds[right]])
+
+
+@lru_cache(maxsize=1)
+def type_codes() -> torch.Tensor:
+    """The index of `TYPES` for each of `forest.CODES`; masks have none and count as operators."""
+    names = ["environment" if kind == "environment_map" else kind for kind in CODES]
+    return torch.tensor([TYPES.index(name) if name in TYPES else 0 for name in names])
 
 
 @lru_cache(maxsize=64)

@@ -34,8 +34,8 @@ class Messages:
         self.console.print(Text.assemble(("unshade: error:", "bold red"), " ", text), soft_wrap=True)
 
     @contextlib.contextmanager
-    def pictures(self, total: int) -> Iterator[Callable[[], None]]:
-        """A bar over many pictures with the time left; call what it gives after each."""
+    def pictures(self, total: int, what: str = "pictures") -> Iterator[Callable[[], None]]:
+        """A bar over many pictures, or whatever they are, with the time left; call what it gives after each."""
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
@@ -45,7 +45,7 @@ class Messages:
             TimeRemainingColumn(),
         )
         with self._progress(*columns) as progress:
-            task = progress.add_task("pictures", total=total)
+            task = progress.add_task(what, total=total)
             yield lambda: progress.advance(task)
 
     @contextlib.contextmanager
