@@ -61,6 +61,10 @@ def test_edit_many_with_a_script(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert load(tmp_path / "out" / "b.json").find("albedo")["color"] == pytest.approx((0, 0, 128 / 255))  # type: ignore[index]
 
 
+def test_several_trees_need_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "expected a folder for several trees" in fails(capsys, 5, "soften", BALL, PLAIN, "-o", tmp_path / "one.json")
+
+
 def test_edit_like_another(tmp_path: Path) -> None:
     done("edit", PLAIN, "--like", BALL, BALL.replace("red", "#40a040"), "-o", tmp_path / "new.json")
     assert load(tmp_path / "new.json").find("albedo") != parse(PLAIN).find("albedo")
@@ -125,6 +129,8 @@ def test_relight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with PILImage.open(tmp_path / "t.gif") as gif:
         assert gif.n_frames == 3
     assert "twice as wide as high" in fails(capsys, 3, "relight", BALL, "--environment", tmp_path / "r.png", "-o", tmp_path / "x.json")
+    huge = ["--turntable", tmp_path / "h.gif", "--frames", 2000, "--size", 2048]
+    assert "take fewer or smaller" in fails(capsys, 5, "relight", BALL, *huge)
     assert "nothing to write" in fails(capsys, 2, "relight", BALL, "--turn", "30,10")
     assert "turns all of the light" in fails(capsys, 2, "relight", BALL, "--turn", "rim=30,10", "-o", tmp_path / "x.json")
     assert "cannot be written" in fails(capsys, 5, "relight", BALL, "--turntable", tmp_path / "no" / "t.gif", "--frames", 2, "--size", 16)

@@ -72,6 +72,8 @@ def apply_to(sources: Sequence[str], change: Callable[[Tree], Tree], output: Pat
         return
     from unshade.terminal import Messages
 
+    if output.suffix.lower() == ".json":
+        raise OutputError(f"{output}: expected a folder for several trees, got a name that ends in .json")
     check_folder(output)
     names = tree_names(sources)
     failed = 0

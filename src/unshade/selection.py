@@ -72,7 +72,8 @@ def holders(root: Node, where: str, parameter: str) -> list[tuple[str, Leaf]]:
     if not found:
         names = [entry.name for kind in seen if kind in KINDS for entry in KINDS[kind].parameters]
         hint = did_you_mean(parameter, dict.fromkeys(names)) if names else "; an operator has none, its leaves do"
-        raise AddressError(f"{where} ({', '.join(seen)}) has no parameter {parameter!r}{hint}")
+        kinds = f" ({', '.join(seen)})" if seen != [where] else ""
+        raise AddressError(f"{where}{kinds} has no parameter {parameter!r}{hint}")
     return list(found.items())
 
 

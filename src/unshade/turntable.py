@@ -35,6 +35,9 @@ BACKGROUND = 0.12
 AXES = {"vertical": (360.0, 0.0, 0.0), "horizontal": (0.0, 360.0, 0.0), "view": (0.0, 0.0, 360.0)}
 """The axes a light can go round: what a whole turn is in degrees to the right, up and about the viewer."""
 
+MOST_PIXELS = 400_000_000
+"""Of all frames of a turntable together, which are held in memory at once."""
+
 VIDEO_SUFFIXES = (".gif", ".mp4")
 
 
@@ -129,7 +132,13 @@ def turntable(tree: Tree, frames: int = 48, size: int = 256, axis: str = "vertic
 
     Args:
         axis: of `AXES`. lights: what the inset shows, which turns as well; None for no inset.
+    Raises:
+        OutputError: more pixels than `MOST_PIXELS`.
     """
+    if frames * size * size > MOST_PIXELS:
+        raise OutputError(
+            f"{frames} frames of {size} x {size} are {frames * size * size:,} pixels, {MOST_PIXELS:,} at most; take fewer or smaller"
+        )
     for number in range(frames):
         angles = [angle * number / frames for angle in AXES[axis]]
         turned = [each if each is None or not number else relight(each, *angles) for each in (tree, lights)]
