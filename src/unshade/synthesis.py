@@ -127,8 +127,16 @@ def batches(
     first = start // mixed
     loaded: Iterator[Batch]
     if workers:
-        numbers = _Counted(first)
-        loader = DataLoader(blocks, batch_size=None, sampler=numbers, num_workers=workers, prefetch_factor=2, collate_fn=_as_it_is)
+        # Spawned: a fork of a process with threads or a GPU may hang.
+        loader = DataLoader(
+            blocks,
+            batch_size=None,
+            sampler=_Counted(first),
+            num_workers=workers,
+            prefetch_factor=2,
+            collate_fn=_as_it_is,
+            multiprocessing_context="spawn",
+        )
         loaded = iter(loader)
     else:
         loaded = (blocks[number] for number in count(first))
