@@ -42,7 +42,7 @@ HEAD = """# Model card
 The weights that ship with `unshade`, written by `unshade train all` and read by the learned method. This page is made from what
 stands in the files (`scripts/model_card.py`). Safetensors, parameters in half precision; how they were trained: [training](training.md).
 
-Made for node images of shade trees: synthetic shaded spheres of the released grammar, black outside the disc. Figures are of nodes from
+Made for node images of shade trees: synthetic shaded spheres of the released grammar and wider ones, black outside the disc. Figures are of nodes from
 the test half of the data, whose colours, directions, masks and environment maps occur in no training tree. Photographs of real spheres are
 another distribution, and nothing here says how well it goes there.
 """
