@@ -27,11 +27,13 @@ MEANINGS = {
     "second_top": "top codes of the second child, nats a code",
     "second_bottom": "bottom codes of the second child, nats a code",
     "operator": "operators right",
-    "type": "types right",
+    "type": "types of children right",
+    "type_balanced": "types of children right, mean over the types",
     "mask_iou": "mask IoU",
     "mix_psnr": "PSNR of the parent mixed by the mask, dB",
     "operator_decoded": "operators right, children decoded from codes",
-    "type_decoded": "types right, children decoded from codes",
+    "type_decoded": "types of children right, children decoded from codes",
+    "type_balanced_decoded": "the same, mean over the types",
     "mask_iou_decoded": "mask IoU, children decoded from codes",
     "mix_psnr_decoded": "PSNR of the parent mixed by the mask, children decoded from codes, dB",
 }
@@ -42,9 +44,9 @@ HEAD = """# Model card
 The weights that ship with `unshade`, written by `unshade train all` and read by the learned method. This page is made from what
 stands in the files (`scripts/model_card.py`). Safetensors, parameters in half precision; how they were trained: [training](training.md).
 
-Made for node images of shade trees: synthetic shaded spheres of the released grammar and wider ones, black outside the disc. Figures are of nodes from
-the test half of the data, whose colours, directions, masks and environment maps occur in no training tree. Photographs of real spheres are
-another distribution, and nothing here says how well it goes there.
+Made for node images of shade trees: synthetic shaded spheres of the released grammar and wider ones, black outside the disc. Figures
+are of nodes from the test half of the data, whose colours, directions, masks and environment maps occur in no training tree. Photographs
+of real spheres are another distribution, and nothing here says how well it goes there.
 """
 
 

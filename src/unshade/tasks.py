@@ -269,18 +269,25 @@ def _types(batch: Batch) -> Tensor:
 
 
 def _judged(heads: Heads, cases: Sequence[tuple[Batch, Image, Image]]) -> dict[str, float]:
-    """How often the heads are right about parents and these children."""
-    operators, types, overlaps, errors = [], [], [], []
+    """How often the heads are right about parents and these children; ``type_balanced`` counts every type alike, however rare."""
+    operators, types, truths, overlaps, errors = [], [], [], [], []
     for batch, left, right in cases:
         operators.append(heads.operator(batch.parent, left, right).argmax(1) == batch.operator)
-        types.append(heads.types(torch.cat([batch.parent, left, right])).argmax(1) == _types(batch))
+        types.append(heads.types(torch.cat([left, right])).argmax(1))
+        truths.append(torch.cat([batch.left_type, batch.right_type]))
         mixed = batch.operator == MIX
         if bool(mixed.any()):
             parent, left, right, truth = batch.parent[mixed], left[mixed], right[mixed], batch.mask[mixed] > 0.5
             found = heads.mask(parent, left, right) > 0.0
             overlaps.append(overlap(found, truth))
             errors.append(psnr(mix(left, right, found.float()), parent))
-    figures = {"operator": float(torch.cat(operators).float().mean()), "type": float(torch.cat(types).float().mean())}
+    truth, right_type = torch.cat(truths), torch.cat(types) == torch.cat(truths)
+    recalls = [right_type[truth == kind].float().mean() for kind in truth.unique()]
+    figures = {
+        "operator": float(torch.cat(operators).float().mean()),
+        "type": float(right_type.float().mean()),
+        "type_balanced": float(torch.stack(recalls).mean()),
+    }
     if overlaps:
         figures |= {"mask_iou": float(torch.cat(overlaps).mean()), "mix_psnr": float(torch.cat(errors).mean())}
     return figures
