@@ -206,10 +206,13 @@ def measure_relighting(known: list[Known]) -> list[dict[str, Any]]:
 def measure_analogies(known: list[Known], cases: int) -> list[dict[str, Any]]:
     rows = []
     chance = random.Random(2)
+    plain = [one for one in known if not one.has_environment]
     for which in Component:
         made = 0
         while made < cases:
-            a, b, p, q = (known[k] for k in chance.sample(range(len(known)), 4))
+            # Every other case without an environment in sight, except where it is what moves.
+            pool = known if made % 2 or which is Component.ENVIRONMENT else plain
+            a, b, p, q = chance.sample(pool, 4)
             truth = swapped(a.truth, b.truth, which)
             answer = swapped(p.truth, q.truth, which)
             if decibels(truth, a.truth) > 35.0 or decibels(answer, p.truth) > 35.0:
@@ -258,6 +261,10 @@ def summed(rows: list[dict[str, Any]], target: float, hard: set[str]) -> dict[st
     return {"all": spread([row["psnr"] for row in rows], target), "without environment": spread(plain, target)}
 
 
+def _judged(rows: list[dict[str, Any]]) -> dict[str, float]:
+    return {"right": round(sum(row["right"] for row in rows) / len(rows), 3), **spread([row["psnr"] for row in rows], 40.0)}
+
+
 def write(name: str, document: dict[str, Any]) -> None:
     RESULTS.mkdir(parents=True, exist_ok=True)
     (RESULTS / f"{name}.json").write_text(
@@ -293,12 +300,9 @@ def main() -> None:
     summary = {}
     for which in [None, *Component]:
         own = [row for row in rows if which is None or row["component"] == which.value]
-        plain = [row for row in own if not row["environment"]]
-        summary[which.value if which else "all"] = {
-            "right": round(sum(row["right"] for row in own) / len(own), 3),
-            **spread([row["psnr"] for row in own], 40.0),
-            **({"median without environments": spread([row["psnr"] for row in plain], 40.0)["median"]} if plain else {}),
-        }
+        summary[which.value if which else "all"] = _judged(own)
+        if any(not row["environment"] for row in own):
+            summary[f"{which.value if which else 'all'}, without environment"] = _judged([row for row in own if not row["environment"]])
     write("analogy", {"summary": summary, "cases": rows})
     write("script", {"summary": measure_script(known)})
 
