@@ -6,6 +6,8 @@ import errno
 import itertools
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -348,3 +350,10 @@ def test_the_command_makes_looks_at_and_checks(tmp_path: Path, capfd: pytest.Cap
     assert cli.run([*made, "--seed", "9"]) == OutputError.exit_code
     assert cli.run(["dataset", "info", str(tmp_path)]) == 1
     assert all(line.startswith("unshade: error: ") for line in capfd.readouterr().err.splitlines())
+
+
+@pytest.mark.slow
+def test_the_page_about_the_data_is_fresh() -> None:
+    script = Path(__file__).resolve().parent.parent / "scripts" / "dataset_page.py"
+    done = subprocess.run([sys.executable, str(script), "--check"], capture_output=True, text=True, timeout=180, check=False)
+    assert done.returncode == 0, done.stderr

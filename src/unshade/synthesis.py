@@ -47,7 +47,7 @@ WIDE_SHARE = {"realistic": 0.3, "toon": 0.5}
 MIXED_BATCHES = 16
 """Batches that are shuffled together, so that the nodes of one tree do not all fall into one batch; fewer where they are large."""
 
-MIXED_NUMBERS = 1 << 25
+MIXED_NUMBERS = 1 << 24
 """Pixels times examples that are shuffled together, at most."""
 
 EXAMPLES_OF_A_TREE = 4
