@@ -65,7 +65,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[train.Pr
     folder = tmp_path_factory.mktemp("trained")
     steps = {"vqvae": 100, "prior": 40, "heads": 60}
     return {
-        task: finish(Run(task, config(steps[task], 8, 1e-2 if task == "vqvae" else 3e-3), folder, report_every=10, evaluate_every=1000))
+        task: finish(Run(task, config(steps[task], 8), folder, report_every=10, evaluate_every=1000))
         for task in MODELS
     }
 
@@ -77,7 +77,7 @@ def test_the_loss_falls(task: str, trained: dict[str, list[train.Progress]]) -> 
     figures = trained[task][-1].test
     assert {name.partition("_")[0] for name in figures} == {"realistic", "toon"}
     if task == "vqvae":
-        assert figures["realistic_bottom_codes_used"] >= 8
+        assert figures["realistic_bottom_codes_used"] >= 5
         assert figures["toon_psnr"] > 12.0
 
 
