@@ -133,9 +133,9 @@ SMALL = Config(
     prior=PriorConfig(channels=64, blocks=2, layers=3, heads=4, condition_channels=96, condition_blocks=3),
     heads=HeadsConfig(channels=32),
     training={
-        "vqvae": TrainingConfig(steps=15_000, batch=12, learning_rate=1e-3),
+        "vqvae": TrainingConfig(steps=12_000, batch=12, learning_rate=1e-3),
         "prior": TrainingConfig(steps=8_000, batch=16, learning_rate=1e-3, weight_decay=0.01),
-        "heads": TrainingConfig(steps=4_000, batch=32, learning_rate=1e-3, weight_decay=0.01),
+        "heads": TrainingConfig(steps=3_000, batch=32, learning_rate=1e-3, weight_decay=0.01),
     },
 )
 """Trains on two cores within hours; its weights ship with the package."""
