@@ -115,10 +115,10 @@ def train(run: Run) -> Iterator[Progress]:
 
         first, began, earlier = position.step, time.monotonic(), position.seconds
         saved = began
-        for batch in _batches(run, position.step, place.rank):
+        for batch in _batches(run, position.step, place):
             mixed = torch.autocast(place.device.type, torch.bfloat16, precision == torch.bfloat16)
             with processes.seeded(run.seed, position.step + 1, place.rank), mixed:
-                outcome = task.outcome(model.train(), batch.to(place.device))
+                outcome = task.outcome(model.train(), batch)
             optimizer.zero_grad()
             outcome.loss.backward()
             place.average_gradients(model)
@@ -157,13 +157,14 @@ def learning_rate(training: TrainingConfig, step: int) -> float:
     return training.learning_rate * min(1.0, up, down)
 
 
-def _batches(run: Run, step: int, rank: int) -> Iterator[Batch]:
+def _batches(run: Run, step: int, place: processes.Place) -> Iterator[Batch]:
     """The batches from a step to the last; another process draws from another seed."""
     from unshade.synthesis import batches
 
     training = run.training
-    seed = run.seed + 7_919 * rank
-    stream = batches(run.style, "train", size=run.config.size, batch=training.batch, seed=seed, start=step, workers=run.workers)
+    seed = run.seed + 7_919 * place.rank
+    sizes = {"size": run.config.size, "batch": training.batch, "workers": run.workers}
+    stream = batches(run.style, "train", seed=seed, start=step, device=place.device, **sizes)
     for _ in range(step, training.steps):
         yield next(stream)
 
@@ -178,8 +179,8 @@ def _look(run: Run, task: Task, model: nn.Module, position: Position, log: Log) 
     with torch.no_grad():
         styles: tuple[Style, ...] = ("realistic", "toon") if run.style == "both" else (run.style,)
         for style in styles:
-            stream = batches(style, "test", size=run.config.size, batch=EVALUATION_BATCH, seed=run.seed)
-            found = [next(stream).to(task.device) for _ in range(count)]
+            stream = batches(style, "test", size=run.config.size, batch=EVALUATION_BATCH, seed=run.seed, device=task.device)
+            found = [next(stream) for _ in range(count)]
             figures |= {f"{style}_{key}": value for key, value in task.evaluate(model, found).items()}
             drawn = task.pictures(model, found[0]).cpu()
             path = run.folder / run.task / "pictures" / f"{position.step:07d}-{style}.png"
