@@ -163,7 +163,8 @@ class Block(nn.Module):
 class PixelSNAIL(nn.Module):
     """Logits of every code of a (size x size) map given the codes before it, in reading order, and a condition.
 
-    The codes' entries in their codebook, (K, E), are given with every call: alike codes are alike inputs.
+    The codes' entries in their codebook, (K, E), are given with every call: alike codes are alike inputs. They are alike outputs too:
+    a part of the logits is that of a Gaussian over the entries, of which the network gives the natural parameters.
     """
 
     places: Tensor
@@ -176,6 +177,7 @@ class PixelSNAIL(nn.Module):
         self.blocks = nn.ModuleList(Block(entry_channels, config) for _ in range(config.blocks))
         self.gain = nn.Parameter(torch.ones(config.channels))
         self.leave = nn.Linear(config.channels, codes)
+        self.aim = nn.Linear(config.channels, entry_channels + 1)
         steps = torch.linspace(-1.0, 1.0, size)
         self.register_buffer("places", torch.stack(torch.meshgrid(steps, steps, indexing="ij"))[None], persistent=False)
 
@@ -188,7 +190,8 @@ class PixelSNAIL(nn.Module):
             for layer in block.layers:
                 x = layer(x, condition)
             x = block.join(x, condition, block.attention(x, seen, self.places))
-        return F.conv2d(F.elu(_norm(x, self.gain)), self.leave.weight[:, :, None, None], self.leave.bias)
+        x = F.elu(_norm(x, self.gain)).permute(0, 2, 3, 1)
+        return (self.leave(x) + self.aim(x) @ _table(entries)).permute(0, 3, 1, 2)
 
     @torch.no_grad()
     def sample(self, entries: Tensor, condition: Tensor, generator: torch.Generator, temperature: float = 1.0) -> Tensor:
@@ -211,10 +214,11 @@ class PixelSNAIL(nn.Module):
             for layer in [*block.layers, block.join]:
                 layer.begin(cache, condition)
             block.attention.begin(cache, count, size * size)
-        drawn = condition.new_zeros(count, size, size, dtype=torch.int64)
+        drawn, table = condition.new_zeros(count, size, size, dtype=torch.int64), _table(entries)
         for position in range(size * size):
             row, column = divmod(position, size)
-            number = _draw(self._step(cache, row, column, told[row, column]), generator, temperature)
+            x = self._step(cache, row, column, told[row, column])
+            number = _draw(self.leave(x) + self.aim(x) @ table, generator, temperature)
             drawn[:, row, column] = number
             seen = F.embedding(number, entries)
             self.enter.put(cache, row, column, seen)
@@ -223,7 +227,7 @@ class PixelSNAIL(nn.Module):
         return drawn
 
     def _step(self, cache: Cache, row: int, column: int, told: Tensor) -> Tensor:
-        """The logits (N, K) of one position, from the cached features of those before."""
+        """The last features (N, C) of one position, from the cached ones of those before."""
         x = self.enter.take(cache, row, column) + told
         places = self.places[0, :, row, column]
         for block in self.blocks:
@@ -232,7 +236,7 @@ class PixelSNAIL(nn.Module):
                 x = layer.step(cache, row, column, x)  # type: ignore[operator]
             looked = block.attention.step(cache, row * self.size + column, x, places)
             x = block.join.step(cache, row, column, x, looked)
-        return self.leave(F.elu(_norm(x, self.gain)))
+        return F.elu(_norm(x, self.gain))
 
     @torch.no_grad()
     def sample_uncached(self, entries: Tensor, condition: Tensor, generator: torch.Generator, temperature: float = 1.0) -> Tensor:
@@ -243,6 +247,11 @@ class PixelSNAIL(nn.Module):
             logits = self(drawn, entries, condition)[:, :, row, column]
             drawn[:, row, column] = _draw(logits, generator, temperature)
         return drawn
+
+
+def _table(entries: Tensor) -> Tensor:
+    """(E + 1, K): what the natural parameters of a Gaussian are multiplied with for its logarithm at every entry."""
+    return torch.cat([entries, -0.5 * entries.square().mean(1, keepdim=True)], 1).T
 
 
 def _draw(logits: Tensor, generator: torch.Generator, temperature: float) -> Tensor:

@@ -29,6 +29,24 @@ def _reader(inputs: int, channels: int, blocks: int) -> nn.Sequential:
 
 
 @dataclass(frozen=True)
+class Tables:
+    """The entries (K, E) of both codebooks, standardised."""
+
+    top: Tensor
+    bottom: Tensor
+
+    @classmethod
+    def of(cls, vqvae: VQVAE) -> Tables:
+        """Those of a VQ-VAE."""
+        return cls(vqvae.top_codebook.standard(), vqvae.bottom_codebook.standard())
+
+
+def _entries(numbers: Tensor, table: Tensor) -> Tensor:
+    """Entries (B, E, h, w) of numbers (B, h, w)."""
+    return F.embedding(numbers, table).permute(0, 3, 1, 2)
+
+
+@dataclass(frozen=True)
 class Entropy:
     """Mean of ``-log p`` of the true codes, in nats a code."""
 
@@ -49,22 +67,23 @@ class ChildPrior(nn.Module):
         self.top = PixelSNAIL(config.top, codes, entry, sizes)
         self.bottom = PixelSNAIL(config.bottom, codes, entry, sizes)
 
-    def _coarse(self, given: Sequence[Codes]) -> Tensor:
+    def _coarse(self, given: Sequence[Codes], tables: Tables) -> Tensor:
         """The condition of the top codes, (B, D, h, w)."""
-        return self.read_coarse(
-            torch.cat([*(c.top_features for c in given), *(F.pixel_unshuffle(c.bottom_features, self.ratio) for c in given)], 1)
-        )
+        tops = [_entries(codes.top, tables.top) for codes in given]
+        bottoms = [F.pixel_unshuffle(_entries(codes.bottom, tables.bottom), self.ratio) for codes in given]
+        return self.read_coarse(torch.cat([*tops, *bottoms], 1))
 
-    def _fine(self, given: Sequence[Codes], coarse: Tensor, top_features: Tensor) -> Tensor:
-        """The condition of the bottom codes, (B, D, H, W): also the child's own top codes."""
-        raised = F.interpolate(torch.cat([coarse, top_features], 1), scale_factor=float(self.ratio), mode="nearest")
-        return self.read_fine(torch.cat([*(c.bottom_features for c in given), raised], 1))
+    def _fine(self, given: Sequence[Codes], coarse: Tensor, top: Tensor, tables: Tables) -> Tensor:
+        """The condition of the bottom codes, (B, D, H, W): also the child's own top codes (B, h, w)."""
+        raised = F.interpolate(torch.cat([coarse, _entries(top, tables.top)], 1), scale_factor=float(self.ratio), mode="nearest")
+        return self.read_fine(torch.cat([*(_entries(codes.bottom, tables.bottom) for codes in given), raised], 1))
 
     def forward(self, vqvae: VQVAE, given: Sequence[Codes], child: Codes) -> Entropy:
         """How badly the codes of ``child`` are foretold."""
-        coarse = self._coarse(given)
-        top = self.top(child.top, vqvae.top_codebook.entries, coarse)
-        bottom = self.bottom(child.bottom, vqvae.bottom_codebook.entries, self._fine(given, coarse, child.top_features))
+        tables = Tables.of(vqvae)
+        coarse = self._coarse(given, tables)
+        top = self.top(child.top, tables.top, coarse)
+        bottom = self.bottom(child.bottom, tables.bottom, self._fine(given, coarse, child.top, tables))
         return Entropy(F.cross_entropy(top.float(), child.top), F.cross_entropy(bottom.float(), child.bottom))
 
     @torch.no_grad()
@@ -82,11 +101,12 @@ class ChildPrior(nn.Module):
         Returns:
             (B * samples, ...), the children of one parent in a row.
         """
-        coarse = self._coarse(given).repeat_interleave(samples, 0)
+        tables = Tables.of(vqvae)
+        coarse = self._coarse(given, tables).repeat_interleave(samples, 0)
         draw_top, draw_bottom = (p.sample if cached else p.sample_uncached for p in (self.top, self.bottom))
-        top = draw_top(vqvae.top_codebook.entries, coarse, generator, temperature)
-        fine = self._fine([repeat(c, samples) for c in given], coarse, vqvae.top_codebook.lookup(top))
-        return vqvae.codes(top, draw_bottom(vqvae.bottom_codebook.entries, fine, generator, temperature))
+        top = draw_top(tables.top, coarse, generator, temperature)
+        fine = self._fine([repeat(codes, samples) for codes in given], coarse, top, tables)
+        return vqvae.codes(top, draw_bottom(tables.bottom, fine, generator, temperature))
 
 
 class Priors(nn.Module):

@@ -66,6 +66,11 @@ class Codebook(nn.Module):
         """Entries (B, D, h, w) of numbers (B, h, w)."""
         return F.embedding(numbers, self.entries).permute(0, 3, 1, 2)
 
+    def standard(self) -> Tensor:
+        """The entries (K, D) with mean 0 and deviation 1 in every channel, as other networks like to read them."""
+        deviation, mean = torch.std_mean(self.entries, 0)
+        return (self.entries - mean) / (deviation + 1e-6)
+
     def nearest(self, flat: Tensor) -> Tensor:
         """Numbers (N,) of the entries nearest to features (N, D)."""
         return (self.entries.square().sum(1) - 2.0 * flat @ self.entries.T).argmin(1)
