@@ -49,7 +49,9 @@ def main() -> None:
         for level in ("top", "bottom"):
             net = getattr(priors.first, level)
             fast, slow, same = measure(net, config, samples, device)
-            print(f"| {level}, {net.size} x {net.size} | {samples} | {fast:.3f} | {slow:.2f} | {slow / fast:.1f} | {'yes' if same else 'no'} |")
+            print(
+                f"| {level}, {net.size} x {net.size} | {samples} | {fast:.3f} | {slow:.2f} | {slow / fast:.1f} | {'yes' if same else 'no'} |"
+            )
 
 
 if __name__ == "__main__":

@@ -64,10 +64,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[train.Pr
     """Every model trained for a few steps, one after the other, as `unshade train all` does."""
     folder = tmp_path_factory.mktemp("trained")
     steps = {"vqvae": 100, "prior": 40, "heads": 60}
-    return {
-        task: finish(Run(task, config(steps[task], 8), folder, report_every=10, evaluate_every=1000))
-        for task in MODELS
-    }
+    return {task: finish(Run(task, config(steps[task], 8), folder, report_every=10, evaluate_every=1000)) for task in MODELS}
 
 
 @pytest.mark.parametrize("task", MODELS)
