@@ -1,0 +1,38 @@
+"""MatCaps as pictures: any size, continued past the silhouette so that no look-up meets a background.
+
+A MatCap is looked up by ``n.xy``: the disc touches the sides of the picture, or leaves ``padding`` pixels on each. Past
+the disc every pixel has the normal of the nearest point of the silhouette.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from unshade.errors import UnshadeError
+from unshade.nodes import Node, Tree
+from unshade.picture_output import write_picture
+from unshade.render import render
+from unshade.sphere import normals_from_xy, sphere_grid
+from unshade.types import Image
+
+BAND_PIXELS = 2**18
+"""A large picture is rendered in bands of rows of about this many pixels; all at once it takes many times its size."""
+
+
+def padded(tree: Tree | Node, size: int, padding: int = 0) -> Image:
+    """(3, size, size) display-encoded picture of the sphere and what continues it.
+
+    Raises UnshadeError where the padding leaves no sphere.
+    """
+    if 2 * padding >= size:
+        raise UnshadeError(f"expected a padding under half the size, got {padding} of {size}")
+    grid = sphere_grid(size) * (size / (size - 2 * padding))
+    bands = [render(tree, normals_from_xy(band)) for band in grid.split(max(1, BAND_PIXELS // size), dim=1)]
+    return torch.cat(bands, dim=1)
+
+
+def write_png(tree: Tree, path: Path, size: int = 512, bits: int | str = 8, padding: int = 0) -> None:
+    """A PNG of 8 or 16 bits."""
+    write_picture(path, padded(tree, size, padding), bits=int(bits))

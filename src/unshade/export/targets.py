@@ -1,0 +1,107 @@
+"""The table of targets: what a tree can be exported to, what gets lost on the way, and which program checked it.
+
+Loads nothing heavy, so that the command line can read it. A target's own file does the writing; it is found by ``writer``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from unshade.errors import UnshadeError, did_you_mean
+
+if TYPE_CHECKING:
+    from unshade.nodes import Tree
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Something that a target cannot hold as it is, and what becomes of it."""
+
+    cannot: str
+    """``a raster leaf as vectors``; stands after "svg cannot hold"."""
+    instead: str
+    where: Callable[[Tree], list[str]]
+    """The addresses of a tree's nodes that this happens to; none for a tree that loses nothing."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """A setting that some targets take."""
+
+    name: str
+    meaning: str
+    type: Literal["integer", "file", "word"]
+    low: int = 0
+    high: int = 0
+    words: tuple[str, ...] = ()
+
+
+OPTIONS = {
+    option.name: option
+    for option in (
+        Option("size", "Width and height in pixels.", "integer", 1, 8192),
+        Option("bits", "Bits a channel.", "word", words=("8", "16")),
+        Option("padding", "Pixels between the silhouette and the edge of the picture.", "integer", 0, 4096),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something to export to."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    summary: str
+    writer: str
+    """``module.function`` below `unshade.export`, called as ``function(tree, path, **options)``; what it returns, if anything, are
+    further warnings, an iterable of sentences."""
+    losses: tuple[Loss, ...] = ()
+    checked_by: str = ""
+    """The program that reads or runs the result in the tests."""
+    options: tuple[str, ...] = ()
+    needs: str = ""
+    """The optional libraries that writing it takes, as one names them to pip."""
+
+    @property
+    def experimental(self) -> bool:
+        """True where no program of the target's own world has checked it."""
+        return not self.checked_by
+
+
+def of_kinds(*kinds: str) -> Callable[[Tree], list[str]]:
+    """The addresses of the leaves and masks of these kinds."""
+    return lambda tree: [address for address, node in tree.walk() if node.kind in kinds]
+
+
+def linear(tree: Tree) -> list[str]:
+    """The operators of a tree that works on linear light; a single leaf blends nothing."""
+    return [address for address, node in tree.walk() if node.kind in ("multiply", "screen", "mix")] if tree.blend_space == "linear" else []
+
+
+PICTURE = Loss("nodes", "the tree becomes one picture, as one asks for", lambda tree: [])
+"""Of targets that are pictures: said in the table, not warned about."""
+
+TARGETS = {
+    target.name: target
+    for target in (
+        Target(
+            "png",
+            (".png",),
+            "a MatCap picture, continued past the silhouette",
+            "matcap.write_png",
+            (PICTURE,),
+            "Pillow",
+            ("size", "bits", "padding"),
+        ),
+    )
+}
+
+
+def target_of(name: str) -> Target:
+    """The target of this name. Raises UnshadeError with the nearest known word."""
+    if name not in TARGETS:
+        raise UnshadeError(f"unknown target {name!r}{did_you_mean(name, TARGETS)}")
+    return TARGETS[name]
