@@ -45,6 +45,9 @@ class Settings:
     alternatives: int = 1
     search: Literal["size", "depth"] = "size"
     objective: Literal["l2", "paper"] = "l2"
+    method: Literal["search", "learned", "hybrid"] = "search"
+    second_stage: Literal["size", "depth", "none"] = "size"
+    weights: str | None = None
     disc: tuple[float, float, float] | None = None
     mask: str | None = None
     artifacts: str = "all"
@@ -54,6 +57,9 @@ class Settings:
         """These settings with the contents of the picture and of the mask, and the version: equal only where the result would be."""
         found: Record = json.loads(json.dumps(dataclasses.asdict(self)))
         found["mask"] = digest(Path(self.mask)) if self.mask else None
+        networks = {key: found.pop(key) for key in ("method", "second_stage", "weights")}
+        if self.method != "search":
+            found |= networks | {"weights": _digest_of_weights(self.weights)}
         return found | {"picture": digest(picture), "version": __version__}
 
 
@@ -72,6 +78,12 @@ def digest(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError:
         return ""
+
+
+def _digest_of_weights(folder: str | None) -> list[str]:
+    from unshade.models import weights
+
+    return [digest(weights.file_of(name, folder)) for name in weights.MODELS]
 
 
 def find_pictures(inputs: Iterable[Path]) -> list[Path]:
@@ -158,7 +170,7 @@ class Log:
             return None
         if entry.get("fingerprint") != job.settings.fingerprint(job.picture):
             return None
-        record = {key: entry.get(key) for key in RECORD_KEYS}
+        record = {key: entry.get(key) for key in RECORD_KEYS} | {key: entry[key] for key in ("stages",) if key in entry}
         return record | {"input": str(job.picture), "tree": str(job.folder / TREE_FILE)}
 
     def add(self, job: Job, record: Record, fingerprint: Record | None = None) -> None:
@@ -221,6 +233,9 @@ def _decompose_picture(job: Job, on_step: Callable[[Step], None] | None) -> Reco
         alternatives=settings.alternatives,
         search=settings.search,
         objective=settings.objective,
+        method=settings.method,
+        second_stage=settings.second_stage,
+        weights=settings.weights,
     )
     for step in decomposition:
         if on_step:
@@ -255,7 +270,8 @@ def _written(job: Job, result: Result, sphere: SphereImage, begin: float) -> Rec
     tree = artifacts.write(result, sphere, job.folder, job.settings.artifacts, job.picture.name, shown) if job.folder else None
     shown["seconds"] = round(time.perf_counter() - begin, 3)
     record = {"input": str(job.picture), "tree": str(tree) if tree else None, **shown}
-    return {key: record[key] for key in RECORD_KEYS}
+    record = {key: record[key] for key in RECORD_KEYS}
+    return record | {"stages": result.stages} if result.stages else record
 
 
 def failure(picture: Path, message: str, exit_code: int) -> Record:

@@ -118,7 +118,24 @@ def cli(context: click.Context) -> None:
     type=click.Choice(["l2", "paper"]),
     default="l2",
     show_default=True,
-    help="Of --search depth: pixels alone, or the paper's L2 plus VGG features, a hundred times slower; needs the perceptual extra.",
+    help="Of the search by depth: pixels alone, or the paper's L2 plus VGG features, a hundred times slower; needs the perceptual extra.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(["search", "learned", "hybrid"]),
+    default="search",
+    show_default=True,
+    help="Who proposes structures: the search, networks alone as in the paper, or networks whose trees the search finishes.",
+)
+@click.option(
+    "--second-stage",
+    type=click.Choice(["size", "depth", "none"]),
+    default="size",
+    show_default=True,
+    help="Of --method learned, for nodes that the networks cannot decompose: our search, the paper's (minutes), or none.",
+)
+@click.option(
+    "--weights", type=click.Path(path_type=str), metavar="DIR", help="Networks that `unshade train` wrote, instead of those that ship."
 )
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes for several pictures; all cores when not given.")
 @click.option("--resume/--force", default=True, help="Skip pictures that are done with the same settings (the default), or do them again.")
@@ -140,13 +157,16 @@ def decompose(
     that opens offline. DIR/results.jsonl notes what is done, so that a later call goes on where this one stopped.
 
     With --json every picture is one line with the keys input, tree (path), psnr, ssim, st_lpips (null without
-    --perceptual), values, leaves, seconds and seed; a picture that failed has input, error and exit_code.
+    --perceptual), values, leaves, seconds and seed; a picture that failed has input, error and exit_code. With --method
+    learned or hybrid it also has stages: the nodes that the networks decomposed, the share that reached the second
+    stage, and what each stage took.
 
     \b
     Examples:
       unshade decompose ball.png -o out
       unshade decompose matcaps/ -o out --preset draft --artifacts tree --json > figures.jsonl
       unshade decompose photo.jpg -o out --disc 412,300,220 --mask hand.png
+      unshade decompose ball.png -o out --method learned --json
     """
     from unshade.terminal import Messages
 
@@ -199,6 +219,8 @@ def _tell(record: batch.Record, messages: Messages, before: str = "") -> None:
         folder = Path(record["tree"]).parent if record["tree"] else None
         page = folder / "report.html" if folder else None
         where = f"  {page if page and page.exists() else folder}" if folder else ""
+        if why := record.get("stages", {}).get("why"):
+            messages.say(f"{record['input']}: decomposed by {record['stages']['method']} alone, since {why}")
         messages.say(f"{record['input']}: {before}{figures_line(record)}{where}", "dim" if before else "")
 
 

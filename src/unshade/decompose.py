@@ -5,17 +5,17 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import torch
 
 from unshade.atoms import Dictionary
-from unshade.errors import PictureError, TreeError, did_you_mean
+from unshade.errors import MissingWeightsError, PictureError, TreeError, did_you_mean
 from unshade.fit.least_squares import COARSE_SIZE, fit_least_squares
 from unshade.fit.pixels import Pixels
 from unshade.growth import Effort, Samples, outline
@@ -25,6 +25,12 @@ from unshade.pictures import SphereImage, read_sphere, sphere_from_array
 from unshade.render import render, srgb_decode
 from unshade.search import Search
 from unshade.sphere import sphere_normals
+
+if TYPE_CHECKING:
+    from unshade.learned import Hybrid, Learned, SecondStage, Settings
+
+METHODS = ("search", "learned", "hybrid")
+"""Who proposes structures: the search, networks alone as in the paper, or networks and the search together."""
 
 POINTS = 2500
 """Points of the full picture on which trees grow once they are good."""
@@ -73,13 +79,17 @@ class Step:
 
 @dataclass(frozen=True)
 class Result:
-    """What a decomposition found: the chosen ``tree``, and the ``family`` from the simplest tree to the most faithful."""
+    """What a decomposition found: the chosen ``tree``, and the ``family`` from the simplest tree to the most faithful.
+
+    ``stages`` says what networks did: `learned.Stages` as a dictionary; None for the search.
+    """
 
     tree: Tree
     family: Family
     psnr: float
     seed: int
     preset: str
+    stages: dict[str, Any] | None = None
 
 
 @contextmanager
@@ -145,6 +155,10 @@ def decompose(
     alternatives: int = 1,
     search: Literal["size", "depth"] = "size",
     objective: Literal["l2", "paper"] = "l2",
+    method: Literal["search", "learned", "hybrid"] = "search",
+    second_stage: SecondStage = "size",
+    weights: str | Path | None = None,
+    settings: Settings | None = None,
 ) -> Decomposition:
     """Decompose a picture of a shaded sphere into a shade tree.
 
@@ -157,9 +171,15 @@ def decompose(
         search: ``size`` grows trees leaf by leaf; ``depth`` is the paper's second stage, structures in order of depth
             fitted by BasinCMA, and takes minutes.
         objective: of ``depth``: ``l2`` compares pixels, ``paper`` pixels and VGG features, a hundred times slower.
+        method: who proposes structures: the ``search`` alone; ``learned``, networks alone as in the paper; ``hybrid``,
+            networks whose trees the search finishes. Without weights the hybrid is the search, and `Result.stages` says so.
+        second_stage: of ``learned``, for nodes that the networks could not decompose: ``size`` is our search, ``depth``
+            the paper's, minutes a picture, ``none`` makes them one colour.
+        weights: folder of the networks; None for those that ship.
+        settings: all about the networks' part, instead of ``second_stage`` and the defaults; see `unshade.learned`.
     Raises:
         PictureError: the picture cannot be used. TreeError: an argument is out of range. MissingExtraError: the
-            ``paper`` objective without its weights.
+            ``paper`` objective without its weights. MissingWeightsError: ``learned`` without its weights.
     """
     if preset not in PRESETS:
         raise TreeError(f"unknown preset {preset!r}{did_you_mean(preset, PRESETS)}")
@@ -171,7 +191,15 @@ def decompose(
         raise TreeError(f"search must be size or depth, got {search!r}")
     if objective not in ("l2", "paper"):
         raise TreeError(f"objective must be l2 or paper, got {objective!r}")
-    if objective == "paper" and search != "depth":
+    if method not in METHODS:
+        raise TreeError(f"unknown method {method!r}{did_you_mean(method, METHODS)}")
+    if second_stage not in ("size", "depth", "none"):
+        raise TreeError(f"second_stage must be size, depth or none, got {second_stage!r}")
+    if method != "search" and search != "size":
+        raise TreeError(f"search='depth' is a method of its own; for {method} give second_stage='depth'")
+    if method == "learned" and alternatives > 1:
+        raise TreeError("alternatives come from the search; take method='search' or 'hybrid'")
+    if objective == "paper" and "depth" not in (search, second_stage if method == "learned" else ""):
         raise TreeError("the paper's objective belongs to search='depth'; the search by size compares pixels")
     if objective == "paper":
         from unshade.models import perceptual
@@ -183,7 +211,8 @@ def decompose(
         chosen = dataclasses.replace(chosen, effort=dataclasses.replace(chosen.effort, max_values=max_values))
     if search == "depth":
         return Decomposition(_by_depth(sphere, chosen, seed, objective), sphere, seed, preset)
-    return Decomposition(_without_gradients(_by_size(sphere, chosen, seed, alternatives)), sphere, seed, preset)
+    main = Search if method == "search" else _learned(sphere, method, seed, second_stage, objective, weights, settings)
+    return Decomposition(_without_gradients(_by_size(sphere, chosen, seed, alternatives, main)), sphere, seed, preset)
 
 
 def fit(image: SphereImage | torch.Tensor | Any | str | Path, tree: Tree, *, locked: Collection[str] = (), seed: int = 0) -> Result:
@@ -276,14 +305,44 @@ def _without_gradients(work: Iterator[Step | Result]) -> Iterator[Step | Result]
         yield found
 
 
-def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int) -> Iterator[Step | Result]:
+Begin: TypeAlias = "Callable[[Samples, Effort], Search | Learned | Hybrid]"
+"""Starts the main search on a picture's pixels."""
+
+
+def _learned(
+    sphere: SphereImage,
+    method: Literal["learned", "hybrid"],
+    seed: int,
+    second_stage: SecondStage,
+    objective: Literal["l2", "paper"],
+    weights: str | Path | None,
+    settings: Settings | None,
+) -> Begin:
+    """A method with networks; the search where the hybrid has none. Raises MissingWeightsError, WeightsError."""
+    from unshade import learned
+    from unshade.inference import Networks
+
+    try:
+        networks = Networks.load(weights)
+    except MissingWeightsError as error:
+        if method == "learned":
+            raise
+        return partial(learned.Unproposed, why=str(error))
+    if method == "learned":
+        given = settings or learned.Settings(second_stage=second_stage, objective=objective)
+        return lambda samples, effort: learned.Learned(sphere.image, sphere.valid, samples, effort, networks, given, seed)
+    given = settings or learned.PROPOSED
+    return lambda samples, effort: learned.Hybrid(sphere.image, sphere.valid, samples, effort, networks, given, seed)
+
+
+def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int, begin: Begin = Search) -> Iterator[Step | Result]:
     samples = _samples(sphere, preset, seed)
     share = preset.effort.max_values
     total = share * alternatives
-    main = Search(samples, preset.effort)
+    main = begin(samples, preset.effort)
     done = 0
     for stage, found in main.run():
-        done = min(max(done, found.values // 2 if stage in ("grow", "plain") else 3 * found.values // 4), share - 1)
+        done = min(max(done, found.values // 2 if stage in ("start", "grow", "plain", "propose") else 3 * found.values // 4), share - 1)
         yield Step(Tree(found.root, exposure=sphere.exposure), _decibels(found.error), found.values, stage, done, total)
     chosen = _member(sphere, found.root)
     others: list[Member] = []
@@ -302,7 +361,8 @@ def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int) 
             curve.append(member)
     family = Family((*curve, chosen), len(curve), tuple(others))
     yield Step(chosen.tree, chosen.psnr, chosen.values, "done", total, total)
-    yield Result(chosen.tree, family, chosen.psnr, seed, preset.name)
+    stages = getattr(main, "stages", None)
+    yield Result(chosen.tree, family, chosen.psnr, seed, preset.name, stages.as_dict() if stages else None)
 
 
 def _left_out() -> Iterator[frozenset[str]]:

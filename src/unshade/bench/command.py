@@ -29,7 +29,8 @@ class BenchError(UnshadeError):
     "methods",
     multiple=True,
     metavar="NAME",
-    help=f"adam:K, basin:K, second:K (K highlights) or search:PRESET; may be repeated. Default: {', '.join(METHODS)}.",
+    help="adam:K, basin:K, second:K (K highlights), search:PRESET, learned:PRESET or hybrid:PRESET; may be repeated. "
+    f"Default: {', '.join(METHODS)}.",
 )
 @click.option(
     "--data",

@@ -2,7 +2,7 @@
 
 ``adam:K``, ``basin:K`` and ``second:K`` fit the numbers of one fixed structure,
 ``screen(multiply(albedo, diffuse), K tinted highlights, a tinted rim)``, from the same start; only the optimiser differs.
-``search:PRESET`` is the whole of `unshade.decompose`.
+``search:PRESET``, ``learned:PRESET`` and ``hybrid:PRESET`` are the whole of `unshade.decompose` by that method.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Literal, TypeAlias, cast
 
 import torch
 
@@ -18,7 +20,9 @@ from unshade.nodes import Node, Operator, Tree, leaf, multiply, screen
 from unshade.pictures import SphereImage
 from unshade.types import Image, Mask
 
-TABLE = ("adam", "basin", "second", "search")
+Proposing: TypeAlias = Literal["search", "learned", "hybrid"]
+
+TABLE = ("adam", "basin", "second", "search", "learned", "hybrid")
 
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
@@ -37,9 +41,8 @@ class Outcome:
 def method_of(name: str) -> Callable[[SphereImage, Mask, int], Outcome]:
     """The method of a name such as ``second:4`` or ``search:best``. Raises UnshadeError."""
     kind, _, argument = name.partition(":")
-    if kind == "search":
-        preset = argument or "balanced"
-        return lambda sphere, scored, seed: _search(sphere, preset, seed)
+    if kind in ("search", "learned", "hybrid"):
+        return partial(_decomposed, preset=argument or "balanced", method=cast(Proposing, kind))
     if kind not in TABLE:
         raise UnshadeError(f"unknown method {name!r}{did_you_mean(kind, TABLE)}")
     if argument and not (argument.isdigit() and 1 <= int(argument) <= 32):
@@ -67,10 +70,16 @@ def _fit(kind: str, image: Image, scored: Mask, root: Node, seed: int) -> Node:
     return fit_least_squares(image, scored, root, seed=seed).root
 
 
-def _search(sphere: SphereImage, preset: str, seed: int) -> Outcome:
+def _decomposed(sphere: SphereImage, scored: Mask, seed: int, *, preset: str, method: Proposing) -> Outcome:
     from unshade.decompose import decompose
 
-    result = decompose(sphere, preset=preset, seed=seed).result()
+    if method != "search":
+        # `decompose` would search where the hybrid has no networks; a row must be what it says.
+        from unshade.inference import Networks
+
+        Networks.load()
+
+    result = decompose(sphere, preset=preset, seed=seed, method=method).result()
     return Outcome(result.tree, tuple((member.values, member.psnr) for member in result.family.members))
 
 

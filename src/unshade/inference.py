@@ -1,0 +1,354 @@
+"""Recursive amortised inference: the paper's first stage, from a picture down to pictures of leaves (Geng et al. 2023, section 3.3).
+
+A *pool* holds node pictures and how they are linked. All nodes of a pool that are neither leaves nor decomposed are drawn
+for at once, T samples each, as one batch: first child, second child, operator f, its mask g, types h. The sample with the least
+
+    L_select = L_recon + alpha L_sim + beta L_blank + gamma L_white
+
+decomposes its node; a node whose every sample is worse than tau is left over, for a second stage to look at, and so is one
+below the depth limit. Where the paper's text has slips, or says less than a program must, we deviate:
+
+- It leaves a node over where ``min L_select < tau``. A high loss is a failure, so it is ``>``.
+- ``L_sim``, ``L_blank`` and ``L_white`` take the distances of both children in one sum, so that one child which is blank, or the
+  parent once more, escapes. Here the worse child counts.
+- They take the logarithm of a distance that can be 0, and reward a child for being far from blank without end, so that a small
+  highlight, nearly blank, can never win. Here the distance is cut to [`LEAST`, `SEEN`] and divided by `SEEN`: a child that is
+  visibly different costs nothing, one that is not costs up to ``log(SEEN / LEAST)``.
+- Blank and white are looked for in *encodings*, where 0 and 1 mean nothing of the kind. Here they are looked for in the pictures.
+- A black or a white child is of no use under multiply and screen, but is a paint like any other under a mix.
+- Distances are root mean squares inside the disc, so that alpha, beta, gamma and tau do not depend on the size of the pictures.
+- g's mask is used as soft as it comes, because our Toon trees hold ramps; the paper's masks are 0 or 1.
+- All open nodes of a pool are one batch, not one node after the other. `Inference.trees` pools are kept side by side (the paper
+  keeps one), ordered by the sum of their losses, tau for each node left over.
+- The codes of a child are those that were drawn for it; encoding its decoded picture once more would only blur it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal, cast
+
+import torch
+import torch.nn.functional as F
+
+from unshade.blend import BLENDS
+from unshade.models import weights
+from unshade.models.config import Config
+from unshade.models.heads import Heads
+from unshade.models.prior import Priors
+from unshade.models.vqvae import VQVAE, Codes
+from unshade.sphere import disc_mask
+from unshade.synthesis import OPERATORS, TYPES
+from unshade.types import Image, Mask
+
+SEEN = 0.05
+"""Root mean square difference from which on two pictures are visibly different."""
+
+LEAST = 1e-3
+"""Smallest difference whose logarithm is taken."""
+
+
+@dataclass(frozen=True)
+class Inference:
+    """How the first stage works; the numbers are ours, the paper gives none."""
+
+    samples: int = 16
+    """T, drawn of each node."""
+    temperature: float = 1.0
+    depth: int = 5
+    """Levels of operators; a node that is still none below them is left over."""
+    similar: float = 0.02
+    """alpha"""
+    blank: float = 0.02
+    """beta"""
+    white: float = 0.02
+    """gamma"""
+    stop: float = 0.08
+    """tau, on the scale of L_recon: 0.08 is 22 dB."""
+    trees: int = 1
+    """Pools kept side by side."""
+    choices: int = 3
+    """Decompositions of a node that pools may differ in."""
+
+
+@dataclass(frozen=True)
+class Networks:
+    """The trained networks, all of one size and one codebook, in evaluation mode."""
+
+    vqvae: VQVAE
+    priors: Priors
+    heads: Heads
+    config: Config
+
+    @staticmethod
+    def load(folder: str | os.PathLike[str] | None = None, device: torch.device | str = "cpu") -> Networks:
+        """Those that ship, or those of a folder.
+
+        Raises:
+            MissingWeightsError: a file is not there. WeightsError: one is damaged, or they do not belong together.
+        """
+        files = [weights.file_of(name, folder) for name in weights.MODELS]
+        return _loaded(Path(folder or weights.FOLDER), tuple(_age(path) for path in files), str(device))
+
+    @property
+    def device(self) -> torch.device:
+        """Where they are."""
+        return next(self.vqvae.parameters()).device
+
+
+def _age(path: Path) -> int:
+    return path.stat().st_mtime_ns if path.is_file() else 0
+
+
+@lru_cache(maxsize=2)
+def _loaded(folder: Path, ages: tuple[int, ...], device: str) -> Networks:
+    """Read once as long as the files stay the same."""
+    vqvae, priors, heads = (weights.load(name, folder, device) for name in ("vqvae", "prior", "heads"))
+    for other, name in ((priors, "prior"), (heads, "heads")):
+        alike = weights.same_codes(vqvae.config, other.config) if name == "prior" else vqvae.config.size == other.config.size
+        if not alike:
+            raise weights.WeightsError(f"{weights.file_of(name, folder)}: made for other images or codes than vqvae.safetensors beside it")
+    return Networks(cast(VQVAE, vqvae.model), cast(Priors, priors.model), cast(Heads, heads.model), vqvae.config)
+
+
+@dataclass(frozen=True)
+class Terms:
+    """The criterion of one sample."""
+
+    recon: float
+    similar: float
+    blank: float
+    white: float
+    select: float
+    """All of them, weighted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A node of a pool."""
+
+    image: Image
+    """(3, S, S)."""
+    codes: Codes
+    """Of the image, a batch of one."""
+    kind: str
+    """What h takes it for, one of `TYPES`."""
+    state: Literal["open", "leaf", "split", "left over"]
+    depth: int
+    """Operators above it."""
+    terms: Terms | None = None
+    """Of its best sample, also where that was not good enough."""
+    operator: str | None = None
+    children: tuple[int, int] | None = None
+    """Places in the pool, of a part that is split."""
+    mask: Mask | None = None
+    """(1, S, S), of a mix."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Nodes and their links; the first is the root."""
+
+    parts: tuple[Part, ...]
+
+    @property
+    def open(self) -> list[int]:
+        """Places of the parts that are neither leaves nor decomposed."""
+        return [place for place, part in enumerate(self.parts) if part.state == "open"]
+
+    @property
+    def left_over(self) -> list[int]:
+        """Places of the parts that a second stage has to look at."""
+        return [place for place, part in enumerate(self.parts) if part.state == "left over"]
+
+    def loss(self, stop: float) -> float:
+        """Sum of the criterion over its nodes; smaller trees lose less."""
+        split = [part.terms.select for part in self.parts if part.state == "split" and part.terms]
+        return sum(split) + stop * len(self.left_over)
+
+
+@dataclass(frozen=True, eq=False)
+class _Split:
+    """One way to decompose a node."""
+
+    terms: Terms
+    operator: str
+    mask: Mask | None
+    children: tuple[Part, Part]
+
+    @property
+    def kind(self) -> tuple[str, ...]:
+        """What tells two ways apart."""
+        return (self.operator, *(child.kind for child in self.children))
+
+
+@dataclass(frozen=True)
+class Round:
+    """The pools after a round, best first, and the nodes that were drawn for so far, over all pools."""
+
+    pools: tuple[Pool, ...]
+    drawn: int
+
+    @property
+    def done(self) -> bool:
+        """Nothing is open any more."""
+        return not any(pool.open for pool in self.pools)
+
+
+def node_image(image: Image, valid: Mask, size: int) -> Image:
+    """A picture of the sphere as the networks know them.
+
+    Args:
+        image: (3, H, H) in [0, 1]. valid: (1, H, H), the pixels that count; the others are filled in from around them.
+    Returns:
+        (3, size, size), 0 outside the disc.
+    """
+    weight = (valid & disc_mask(image.shape[-1], device=image.device)).to(image)
+    side = image.shape[-1]
+    # From coarse to fine: what a fine average does not know, the coarser one has.
+    filled = (image * weight).sum((1, 2), keepdim=True) / weight.sum().clamp(min=1.0)
+    for step in (4, 8, 16, 32, 64, 128, 256, 512):
+        level = min(step, size)
+        if level <= side:
+            share = F.adaptive_avg_pool2d(weight[None], level)
+            mean = F.adaptive_avg_pool2d((image * weight)[None], level) / share.clamp(min=1e-6)
+        else:
+            share, mean = (F.interpolate(part[None], level, mode="bilinear") for part in (weight, image * weight))
+            mean = mean / share.clamp(min=1e-6)
+        below = F.interpolate(filled[None], level, mode="bilinear") if filled.shape[-1] > 1 else filled[None]
+        trust = (4.0 * share).clamp(max=1.0)
+        filled = (trust * mean + (1.0 - trust) * below)[0]
+        if level == size:
+            break
+    return filled.clamp(0.0, 1.0) * disc_mask(size, device=image.device)
+
+
+def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> Iterator[Round]:
+    """Decompose a picture from the top down; a round is one level of all pools.
+
+    Args:
+        image: (3, S, S) from `node_image`.
+        seed: of all samples. The same seed gives the same pools on the same machine and threads.
+    """
+    generator = torch.Generator(networks.device).manual_seed(seed)
+    with torch.no_grad():
+        codes = networks.vqvae.encode(image[None].to(networks.device))
+    # Its type is not asked: a picture that is one leaf has a blank child however it is split, so it is left over.
+    pools: tuple[Pool, ...] = (Pool((Part(image.to(networks.device), codes, "operator", "open", 0),)),)
+    drawn = 0
+    while any(pool.open for pool in pools):
+        # Pools share their upper parts, which are drawn for once.
+        parts = list({id(pool.parts[place]): pool.parts[place] for pool in pools for place in pool.open}.values())
+        with torch.no_grad():
+            found = _splits(parts, networks, settings, generator)
+        splits = {id(part): ways for part, ways in zip(parts, found, strict=True)}
+        drawn += len(parts)
+        grown = [variant for pool in pools for variant in _grown(pool, splits, settings)]
+        pools = tuple(sorted(grown, key=lambda pool: pool.loss(settings.stop))[: settings.trees])
+        yield Round(pools, drawn)
+
+
+def _splits(parts: Sequence[Part], networks: Networks, settings: Inference, generator: torch.Generator) -> list[list[_Split]]:
+    """For each part its decompositions, best first, no two of one kind."""
+    count = settings.samples
+    given = _stacked([part.codes for part in parts])
+    drawn = networks.priors.sample_children(networks.vqvae, given, count, generator, settings.temperature)
+    parents = torch.stack([part.image for part in parts]).repeat_interleave(count, 0)
+    left, right = (networks.vqvae.decode(codes) for codes in drawn)
+    operators = networks.heads.operator(parents, left, right).argmax(1)
+    masks = torch.sigmoid(networks.heads.mask(parents, left, right))
+    kinds = [networks.heads.types(child).argmax(1).tolist() for child in (left, right)]
+    terms = criterion(parents, left, right, operators, masks, settings)
+    found: list[list[_Split]] = []
+    for number, part in enumerate(parts):
+        rows = range(number * count, (number + 1) * count)
+        ways: dict[tuple[str, ...], _Split] = {}
+        for row in sorted(rows, key=lambda row: (terms[row].select, row)):
+            operator = OPERATORS[int(operators[row])]
+            children = tuple(
+                _child(images[row], _one(codes, row), TYPES[kind[row]], part.depth + 1, settings)
+                for images, codes, kind in zip((left, right), drawn, kinds, strict=True)
+            )
+            way = _Split(terms[row], operator, masks[row] if operator == "mix" else None, cast("tuple[Part, Part]", children))
+            ways.setdefault(way.kind, way)
+            if len(ways) == settings.choices:
+                break
+        found.append(list(ways.values()))
+    return found
+
+
+def _child(image: Image, codes: Codes, kind: str, depth: int, settings: Inference) -> Part:
+    state: Literal["open", "leaf", "left over"] = "leaf"
+    if kind == "operator":
+        state = "open" if depth < settings.depth else "left over"
+    return Part(image, codes, kind, state, depth)
+
+
+def criterion(parents: Image, left: Image, right: Image, operators: torch.Tensor, masks: Mask, settings: Inference) -> list[Terms]:
+    """L_select of B samples and its terms.
+
+    Args:
+        parents, left, right: (B, 3, S, S). operators: (B,), index of `OPERATORS`. masks: (B, 1, S, S) in [0, 1].
+    """
+    disc = disc_mask(parents.shape[-1], device=parents.device)
+    rebuilt = torch.stack([BLENDS[name].apply(left, right, *([masks] if name == "mix" else [])) for name in OPERATORS])
+    rebuilt = rebuilt[operators, torch.arange(len(operators), device=operators.device)]
+    recon = _distance(parents, rebuilt, disc)
+    mixed = operators == OPERATORS.index("mix")
+
+    def near(other: Image, ignored: torch.Tensor | None = None) -> torch.Tensor:
+        least = torch.minimum(_distance(left, other, disc), _distance(right, other, disc))
+        found = -(least.clamp(LEAST, SEEN) / SEEN).log()
+        return found if ignored is None else found.masked_fill(ignored, 0.0)
+
+    similar = near(parents)
+    blank, white = near(torch.zeros_like(parents), mixed), near(disc.to(parents).expand_as(parents), mixed)
+    select = recon + settings.similar * similar + settings.blank * blank + settings.white * white
+    columns = (column.tolist() for column in (recon, similar, blank, white, select))
+    return [Terms(*row) for row in zip(*columns, strict=True)]
+
+
+def _distance(a: Image, b: Image, disc: Mask) -> torch.Tensor:
+    """Root mean square difference inside the disc, (B,)."""
+    return ((a - b).square().mean(1) * disc).sum((1, 2)).div(disc.sum()).sqrt()
+
+
+def _grown(pool: Pool, splits: dict[int, list[_Split]], settings: Inference) -> list[Pool]:
+    """The pool with every open part split in the best way or left over, and where several pools are kept, with one part split otherwise."""
+    places = pool.open
+    if not places:
+        return [pool]
+    ways = {place: splits[id(pool.parts[place])] for place in places}
+    best = dict.fromkeys(places, 0)
+    plans = [best]
+    if settings.trees > 1:
+        plans += [best | {place: k} for place in places for k in range(1, len(ways[place])) if ways[place][k].terms.select <= settings.stop]
+    return [_split(pool, {place: ways[place][k] for place, k in plan.items()}, settings.stop) for plan in plans]
+
+
+def _split(pool: Pool, ways: dict[int, _Split], stop: float) -> Pool:
+    parts = list(pool.parts)
+    for place, way in ways.items():
+        if way.terms.select > stop:
+            parts[place] = dataclasses.replace(parts[place], state="left over", terms=way.terms)
+            continue
+        parts[place] = dataclasses.replace(
+            parts[place], state="split", terms=way.terms, operator=way.operator, mask=way.mask, children=(len(parts), len(parts) + 1)
+        )
+        parts += way.children
+    return Pool(tuple(parts))
+
+
+def _one(codes: Codes, row: int) -> Codes:
+    keep = slice(row, row + 1)
+    return Codes(codes.top[keep], codes.bottom[keep], codes.top_features[keep], codes.bottom_features[keep])
+
+
+def _stacked(codes: Sequence[Codes]) -> Codes:
+    names = ("top", "bottom", "top_features", "bottom_features")
+    return Codes(*(torch.cat([getattr(part, name) for part in codes]) for name in names))

@@ -1,0 +1,418 @@
+"""The learned methods: the node pool and its criterion, leaves from decoded pictures, and decomposing with networks.
+
+Networks of the size `tiny` know nothing, which is enough for the mechanics. An oracle, which draws the true children of a known
+tree, stands in for trained priors where the rest is to be judged.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from unshade import decoded, inference, learned, synthesis
+from unshade.cli import run as run_command
+from unshade.decompose import Result, decompose
+from unshade.errors import MissingWeightsError, TreeError
+from unshade.grammar import same_structure
+from unshade.inference import Inference, Networks, Part, Round, Terms, criterion, infer, node_image
+from unshade.models import weights
+from unshade.models.config import find
+from unshade.models.vqvae import Codes
+from unshade.nodes import Leaf, Node, Operator, Tree, leaf, mix, multiply, screen, walk
+from unshade.parameters import Layout
+from unshade.pictures import write_picture
+from unshade.proposals import arranged
+from unshade.render import evaluate, render
+from unshade.sphere import disc_mask, sphere_normals
+
+SIZE = 32
+SETTINGS = Inference(samples=3, stop=10.0, depth=2)
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of untrained weights."""
+    folder = tmp_path_factory.mktemp("weights")
+    torch.manual_seed(3)
+    for name, make in weights.MODELS.items():
+        model = make(find("tiny"))
+        if name == "vqvae":
+            model.train()(torch.rand(8, 3, 16, 16))  # fills the codebooks
+        weights.save(weights.file_of(name, folder), name, model, find("tiny"), {})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def networks(tiny: Path) -> Networks:
+    return Networks.load(tiny)
+
+
+def picture(root: Node, size: int = 96) -> torch.Tensor:
+    return render(root, sphere_normals(size))
+
+
+SIMPLE = screen(
+    multiply(leaf("albedo", color=(0.8, 0.3, 0.2)), leaf("diffuse", direction=(0.3, 0.6, 0.7), ambient=0.3)),
+    leaf("highlight", direction=(-0.3, 0.4, 0.85), sharpness=40.0, amplitude=1.0),
+)
+
+
+def pools(networks: Networks, settings: Inference, seed: int = 0) -> list[Round]:
+    return list(infer(node_image(picture(SIMPLE), disc_mask(96), 16), networks, settings, seed))
+
+
+def test_a_pool_ends_with_every_node_decomposed_a_leaf_or_left_over(networks: Networks) -> None:
+    rounds = pools(networks, SETTINGS)
+    assert rounds[-1].done and 1 <= len(rounds) <= SETTINGS.depth
+    (pool,) = rounds[-1].pools
+    assert pool.parts[0].state == "split"
+    linked = [child for part in pool.parts for child in part.children or ()]
+    assert sorted(linked) == list(range(1, len(pool.parts)))
+    for part in pool.parts:
+        assert part.state in ("leaf", "split", "left over") and part.depth <= SETTINGS.depth
+        assert (part.state == "split") == (part.operator is not None) == (part.children is not None)
+        assert (part.mask is not None) == (part.operator == "mix")
+        if part.state == "leaf":
+            assert part.kind != "operator"
+        if part.depth == SETTINGS.depth:
+            assert part.state != "split"
+
+
+def test_the_same_seed_draws_the_same_pools(networks: Networks) -> None:
+    def pictures(seed: int) -> torch.Tensor:
+        return torch.stack([part.image for part in pools(networks, SETTINGS, seed)[-1].pools[0].parts])
+
+    assert torch.equal(pictures(4), pictures(4))
+    other = pictures(5)
+    assert other.shape != pictures(4).shape or not torch.equal(other, pictures(4))
+
+
+def test_a_node_whose_every_sample_is_bad_is_left_over(networks: Networks) -> None:
+    (pool,) = pools(networks, dataclasses.replace(SETTINGS, stop=-1.0))[-1].pools
+    (root,) = pool.parts
+    assert root.state == "left over" and root.terms is not None and root.terms.select > -1.0
+    assert pool.left_over == [0]
+
+
+def test_more_samples_never_choose_a_worse_one(networks: Networks) -> None:
+    settings = dataclasses.replace(SETTINGS, samples=8)
+    image = node_image(picture(SIMPLE), disc_mask(96), 16)
+    part = Part(image, networks.vqvae.encode(image[None]), "operator", "open", 0)
+    (ways,) = inference._splits([part], networks, settings, torch.Generator().manual_seed(0))
+    losses = [way.terms.select for way in ways]
+    assert losses == sorted(losses) and len({way.kind for way in ways}) == len(ways)
+
+
+def test_several_pools_differ_and_the_best_comes_first(networks: Networks) -> None:
+    def decided(classes: int) -> Any:
+        # Untrained heads say the same of every picture.
+        return lambda *images: torch.nn.functional.one_hot((images[-1].mean((1, 2, 3)) * 1e6).long() % classes, classes).float()
+
+    heads: Any = SimpleNamespace(operator=decided(3), mask=networks.heads.mask, types=decided(8))
+    networks = dataclasses.replace(networks, heads=heads)
+    settings = dataclasses.replace(SETTINGS, samples=12, trees=3)
+    found = pools(networks, settings)[-1].pools
+    assert 1 < len(found) <= 3
+    losses = [pool.loss(settings.stop) for pool in found]
+    assert losses == sorted(losses)
+    assert len({tuple((part.kind, part.operator) for part in pool.parts) for pool in found}) == len(found)
+
+
+def terms(parent: torch.Tensor, left: torch.Tensor, right: torch.Tensor, operator: str, mask: torch.Tensor | None = None) -> Terms:
+    masks = torch.zeros(1, 1, SIZE, SIZE) if mask is None else mask[None]
+    number = torch.tensor([synthesis.OPERATORS.index(operator)])
+    return criterion(parent[None], left[None], right[None], number, masks, Inference())[0]
+
+
+def test_the_criterion_of_a_right_decomposition_is_nothing() -> None:
+    disc = disc_mask(SIZE)
+    left, right = (picture(child, SIZE) * disc for child in SIMPLE.children)
+    found = terms(picture(SIMPLE, SIZE) * disc, left, right, "screen")
+    assert found.recon == pytest.approx(0.0, abs=1e-6)
+    assert found.similar == found.blank == found.white == 0.0
+
+
+def test_one_useless_child_is_enough_to_cost() -> None:
+    disc = disc_mask(SIZE)
+    parent = picture(SIMPLE, SIZE) * disc
+    black, white = torch.zeros_like(parent), disc.expand(3, -1, -1).float()
+    blank, copied = terms(parent, parent, black, "screen"), terms(parent, parent, white, "multiply")
+    assert blank.recon < 1e-6 and blank.blank > 1.0 and blank.similar > 1.0
+    assert copied.recon < 1e-6 and copied.white > 1.0 and copied.similar > 1.0
+    assert blank.select > 0.05 and copied.select > 0.05
+
+
+def test_black_and_white_paint_is_welcome_in_a_mix() -> None:
+    disc = disc_mask(SIZE)
+    mask = disc & (sphere_normals(SIZE)[:1] > 0)
+    black, white = torch.zeros(3, SIZE, SIZE), disc.expand(3, -1, -1).float()
+    found = terms(mask.expand(3, -1, -1).float(), white, black, "mix", mask.float())
+    assert found.recon < 1e-6 and found.select < 1e-6
+
+
+@pytest.mark.parametrize("size", [16, 64, 200])
+def test_a_node_image_fills_in_what_does_not_count(size: int) -> None:
+    image = torch.full((3, 96, 96), 0.5)
+    valid = disc_mask(96) & (sphere_normals(96)[:1] > -0.3)
+    image = torch.where(valid, image, torch.ones(()))
+    found = node_image(image, valid, size)
+    disc = disc_mask(size)[0]
+    assert found.shape == (3, size, size) and (found[:, ~disc] == 0.0).all()
+    assert torch.allclose(found[:, disc], torch.tensor(0.5), atol=1e-4)
+
+
+def test_a_node_image_is_the_picture_made_small() -> None:
+    found, true = node_image(picture(SIMPLE, 256), disc_mask(256), 64), picture(SIMPLE, 64) * disc_mask(64)
+    assert float((found - true).square().mean().sqrt()) < 0.01
+
+
+LEAVES = [
+    leaf("albedo", color=(0.2, 0.5, 0.7)),
+    leaf("diffuse", direction=(0.3, 0.5, 0.8), ambient=0.3),
+    leaf("highlight", direction=(0.3, 0.5, 0.8), sharpness=60.0, amplitude=1.3),
+    leaf("toon_diffuse", direction=(-0.3, 0.5, 0.8), ambient=0.4, threshold=0.1, softness=0.1),
+    leaf("toon_highlight", direction=(-0.3, 0.5, 0.8), radius=0.25, brightness=0.6),
+    leaf("rim", direction=(-0.3, 0.5, 0.1), exponent=2.0),
+    leaf("environment", direction=(0.3, 0.5, 0.8, -0.6, 0.3, 0.1), sharpness=(10.0, 3.0), color=(1.0, 0.5, 0.5, 0.3, 0.3, 0.8)),
+]
+
+
+@pytest.mark.parametrize("true", LEAVES, ids=lambda entry: entry.kind)
+def test_a_leaf_is_found_in_a_noisy_picture(true: Leaf) -> None:
+    disc = disc_mask(64)
+    noise = 0.03 * torch.randn(3, 64, 64, generator=torch.Generator().manual_seed(1))
+    found = decoded.leaf_of(true.kind, ((picture(true, 64) + noise) * disc).clamp(0.0, 1.0))
+    assert found.kind == true.kind
+    error = (picture(found, 64) - picture(true, 64))[:, disc[0]].square().mean().sqrt()
+    assert float(error) < (0.05 if "toon" in true.kind else 0.02)
+
+
+@pytest.mark.parametrize(
+    "true",
+    [
+        leaf("threshold", direction=(0.3, 0.5, 0.4), threshold=0.1),
+        leaf("threshold", direction=(0.3, 0.5, 0.4), threshold=0.1, softness=1.0),
+        leaf("stripe", direction=(0.8, 0.5, 0.4), center=0.2, width=0.3),
+    ],
+    ids=["edge", "ramp", "stripe"],
+)
+def test_a_mask_is_found(true: Leaf) -> None:
+    def drawn(mask: Leaf) -> torch.Tensor:
+        layout = Layout.of(mask)
+        return evaluate(mask, sphere_normals(64), layout.pack(mask).float(), layout) * disc_mask(64)
+
+    found = decoded.mask_of(drawn(true))
+    assert found.kind == true.kind
+    assert float((drawn(found) - drawn(true)).abs().mean()) < 0.03
+
+
+def test_an_arranged_tree_looks_the_same_and_is_flat() -> None:
+    from itertools import islice
+
+    for tree in islice(synthesis.trees("both", "train", seed=5), 12):
+        found = arranged(tree.root)
+        assert torch.allclose(picture(found, 32), picture(tree.root, 32), atol=2e-5)
+        for _, node in walk(found):
+            if isinstance(node, Operator) and node.kind != "mix":
+                assert all(child.kind != node.kind for child in node.children)
+
+
+class Oracle:
+    """Draws the true children of the operators of a tree, from codes that are the pictures themselves."""
+
+    size = 64
+
+    def __init__(self, root: Node) -> None:
+        self.nodes = [node for _, node in walk(root)]
+        self.images = [picture(node, self.size) * disc_mask(self.size) if not _is_mask(node) else None for node in self.nodes]
+        self.config = SimpleNamespace(size=self.size)
+        self.vqvae = self.priors = self.heads = self
+        self.device = torch.device("cpu")
+
+    def nearest(self, image: torch.Tensor) -> Node:
+        known = [(float((image - other).square().mean()), k) for k, other in enumerate(self.images) if other is not None]
+        return self.nodes[min(known)[1]]
+
+    def encode(self, images: torch.Tensor) -> Codes:
+        return Codes(images, images, images, images)
+
+    def decode(self, codes: Codes) -> torch.Tensor:
+        return codes.top
+
+    def sample_children(self, _vqvae: Any, given: Codes, samples: int, *_: Any) -> tuple[Codes, Codes]:
+        found = [self.nearest(image) for image in given.top for _ in range(samples)]
+        sides = ([self.images[self.nodes.index(node.children[k])] for node in found] for k in (0, 1))  # type: ignore[union-attr]
+        left, right = (torch.stack(side) for side in sides)  # type: ignore[arg-type]
+        return self.encode(left), self.encode(right)
+
+    def operator(self, parents: torch.Tensor, *_: Any) -> torch.Tensor:
+        numbers = [synthesis.OPERATORS.index(self.nearest(parent).kind) for parent in parents]
+        return torch.nn.functional.one_hot(torch.tensor(numbers), 3).float()
+
+    def mask(self, parents: torch.Tensor, *_: Any) -> torch.Tensor:
+        found = []
+        for parent in parents:
+            node = self.nearest(parent)
+            assert isinstance(node, Operator)
+            mask = node.mask or leaf("threshold")
+            layout = Layout.of(mask)
+            found.append(evaluate(mask, sphere_normals(self.size), layout.pack(mask).float(), layout)[:1])
+        return torch.stack(found) * 40.0 - 20.0
+
+    def types(self, images: torch.Tensor) -> torch.Tensor:
+        kinds = [self.nearest(image) for image in images]
+        numbers = [0 if isinstance(node, Operator) else synthesis.TYPES.index(node.kind) for node in kinds]
+        return torch.nn.functional.one_hot(torch.tensor(numbers), len(synthesis.TYPES)).float()
+
+
+def _is_mask(node: Node) -> bool:
+    return isinstance(node, Leaf) and node.kind in ("threshold", "stripe")
+
+
+def decomposed(root: Node, monkeypatch: pytest.MonkeyPatch, **options: Any) -> Result:
+    oracle: Any = Oracle(root)
+    monkeypatch.setattr(Networks, "load", lambda *_: oracle)
+    options = {"settings": learned.Settings(Inference(samples=2)), **options}
+    return decompose((picture(root, 256) * 255.0).round() / 255.0, **options).result()
+
+
+PAINTED = screen(
+    multiply(
+        mix(
+            leaf("albedo", color=(0.8, 0.6, 0.2)),
+            leaf("albedo", color=(0.2, 0.3, 0.6)),
+            leaf("threshold", direction=(0.4, 0.2, 0.9), threshold=0.4),
+        ),
+        leaf("toon_diffuse", direction=(0.3, 0.6, 0.7), ambient=0.4, threshold=0.0, softness=0.1),
+    ),
+    leaf("toon_highlight", direction=(-0.3, 0.5, 0.8), radius=0.25, brightness=0.6),
+)
+
+
+@pytest.mark.parametrize("root", [SIMPLE, PAINTED], ids=["realistic", "toon"])
+def test_with_right_proposals_the_tree_comes_out_to_its_rounding(root: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = decomposed(root, monkeypatch, method="learned")
+    assert found.psnr > 50.0 and same_structure(found.tree, Tree(root))
+    assert found.stages is not None
+    assert found.stages["second_stage_share"] == 0.0 and found.stages["second_stage_fits"] == 0
+    assert found.stages["nodes"] == sum(isinstance(node, Operator) for _, node in walk(root))
+    assert {"first stage", "leaves", "whole tree"} <= set(found.stages["seconds"])
+    sizes = [member.values for member in found.family.members]
+    assert sizes == sorted(sizes) and len(sizes) > 2
+
+
+def test_the_ablation_takes_parts_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = decomposed(SIMPLE, monkeypatch, method="learned")
+    plain = decomposed(SIMPLE, monkeypatch, method="learned", settings=learned.Settings(Inference(samples=1), overall=False))
+    none = decomposed(
+        SIMPLE, monkeypatch, method="learned", settings=learned.Settings(Inference(samples=1, stop=-1.0), second_stage="none")
+    )
+    assert none.psnr < plain.psnr < whole.psnr
+    assert none.tree.leaves == 1 and none.stages is not None and none.stages["second_stage_share"] == 1.0
+
+
+def test_a_hybrid_stops_where_a_proposal_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = decomposed(SIMPLE, monkeypatch, method="hybrid")
+    assert found.psnr > 50.0 and same_structure(found.tree, Tree(SIMPLE))
+    assert found.stages is not None and found.stages["method"] == "hybrid"
+
+
+DRAFT: dict[str, Any] = {"preset": "draft", "settings": learned.Settings(SETTINGS)}
+
+
+@pytest.mark.parametrize("method", ["learned", "hybrid"])
+def test_untrained_networks_still_give_a_tree(method: Any, tiny: Path) -> None:
+    results = [decompose(picture(SIMPLE), method=method, weights=tiny, seed=2, **DRAFT).result() for _ in range(2)]
+    assert results[0].tree == results[1].tree and results[0].family == results[1].family
+    assert results[0].tree.values <= 30
+    stages = results[0].stages
+    assert stages is not None and 0.0 <= stages["second_stage_share"] <= 1.0 and stages["samples"] == 3 * stages["drawn_nodes"] > 0
+    json.dumps(stages)
+
+
+def test_a_hybrid_is_never_worse_than_a_search(tiny: Path) -> None:
+    alone = decompose(picture(SIMPLE), preset="draft").result()
+    assert decompose(picture(SIMPLE), method="hybrid", weights=tiny, **DRAFT).result().psnr >= alone.psnr - 0.5
+
+
+def test_a_learned_decomposition_can_be_cancelled(tiny: Path) -> None:
+    work = decompose(picture(SIMPLE), method="learned", weights=tiny, **DRAFT)
+    stages = [next(work).stage, next(work).stage]
+    work.cancel()
+    assert stages == ["start", "propose"] and work.result().tree.leaves >= 1
+
+
+def test_the_largest_size_is_kept(tiny: Path) -> None:
+    found = decompose(picture(PAINTED), method="learned", weights=tiny, max_values=9, **DRAFT).result()
+    assert found.tree.values <= 9
+
+
+@pytest.mark.slow
+def test_the_papers_second_stage(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learned, "NODE_BUDGET", learned.search_depth.Budget(ranked=4, fitted=1, extended=1))
+    settings = learned.Settings(dataclasses.replace(SETTINGS, stop=-1.0), second_stage="depth")
+    found = decompose(picture(SIMPLE, 64), method="learned", weights=tiny, settings=settings, preset="draft").result()
+    assert found.stages is not None and found.stages["second_stage_fits"] >= 5 and found.tree.leaves >= 1
+
+
+def test_without_weights_learned_says_so_and_the_rest_goes_on(tmp_path: Path) -> None:
+    with pytest.raises(MissingWeightsError, match="unshade train all"):
+        decompose(picture(SIMPLE), method="learned", weights=tmp_path)
+    alone = decompose(picture(SIMPLE), preset="draft").result()
+    instead = decompose(picture(SIMPLE), preset="draft", method="hybrid", weights=tmp_path).result()
+    assert instead.tree == alone.tree and alone.stages is None
+    assert instead.stages is not None and instead.stages["method"] == "search" and "no such weights" in instead.stages["why"]
+
+
+def test_weights_that_do_not_belong_together_are_refused(tiny: Path, tmp_path: Path) -> None:
+    for name in weights.MODELS:
+        weights.file_of(name, tmp_path).write_bytes(weights.file_of(name, tiny).read_bytes())
+    larger = dataclasses.replace(find("tiny"), size=32)
+    weights.save(weights.file_of("heads", tmp_path), "heads", weights.MODELS["heads"](larger), larger, {})
+    with pytest.raises(weights.WeightsError, match=r"heads\.safetensors: made for other images"):
+        Networks.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "learnt"}, "did you mean 'learned'"),
+        ({"method": "learned", "second_stage": "deep"}, "second_stage must be"),
+        ({"method": "learned", "search": "depth"}, "second_stage='depth'"),
+        ({"method": "learned", "alternatives": 2}, "alternatives come from the search"),
+        ({"method": "hybrid", "objective": "paper"}, "paper's objective"),
+    ],
+)
+def test_arguments_that_do_not_fit(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(TreeError, match=message):
+        decompose(picture(SIMPLE), **options)
+
+
+def test_the_command_reports_the_stages(tiny: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    write_picture(tmp_path / "ball.png", picture(SIMPLE), disc_mask(96).float())
+    words = ["decompose", str(tmp_path / "ball.png"), "--preset", "draft", "--artifacts", "tree", "--json", "-o", str(tmp_path / "out")]
+    assert run_command([*words, "--method", "learned", "--weights", str(tiny), "--second-stage", "none"]) == 0
+    first = json.loads(capfd.readouterr().out)
+    assert first["stages"]["method"] == "learned" and set(first["stages"]["seconds"]) >= {"first stage", "leaves"}
+    # Done before with the same networks, and not with others.
+    assert run_command([*words, "--method", "learned", "--weights", str(tiny), "--second-stage", "none"]) == 0
+    assert json.loads(capfd.readouterr().out) == first
+    assert run_command([*words, "--method", "learned", "--weights", str(tmp_path)]) == 6
+    assert "no such weights" in capfd.readouterr().err
+    assert run_command([*words, "--method", "hybrid", "--weights", str(tmp_path)]) == 0
+    assert "decomposed by search alone" in capfd.readouterr().err
+
+
+@pytest.mark.skipif(not weights.available(), reason="no weights ship with this checkout")
+@pytest.mark.parametrize("style", ["realistic", "toon"])
+def test_the_shipped_networks_decompose(style: Any) -> None:
+    tree = next(synthesis.trees(style, "test", seed=11))
+    image = (picture(tree.root, 256) * 255.0).round() / 255.0
+    found = decompose(image, method="learned").result()
+    assert found.psnr > 20.0 and found.stages is not None and found.stages["second_stage_share"] < 1.0
