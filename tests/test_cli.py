@@ -64,6 +64,7 @@ class StandInResult:
     family: Family
     seed: int
     preset: str = "balanced"
+    stages: dict[str, Any] | None = None
 
     @property
     def tree(self) -> Tree:
@@ -239,7 +240,8 @@ def test_decompose_writes_everything(decomposed: list[dict[str, Any]], ball: Pat
         "best",
     )
     assert told.code == 0, told.err
-    assert decomposed == [{"preset": "best", "max_values": 40, "seed": 5, "alternatives": 2, "search": "depth", "objective": "l2"}]
+    asked = {"preset": "best", "max_values": 40, "seed": 5, "alternatives": 2, "search": "depth", "objective": "l2"}
+    assert decomposed == [asked | {"method": "search", "second_stage": "size", "weights": None}]
     folder = tmp_path / "out" / "ball"
     assert {"tree.json", "render.png", "difference.png", "tree.svg", "report.html"} <= set(files(folder))
     assert len(list((folder / "layers").iterdir())) == 5

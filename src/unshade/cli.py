@@ -134,9 +134,7 @@ def cli(context: click.Context) -> None:
     show_default=True,
     help="Of --method learned, for nodes that the networks cannot decompose: our search, the paper's (minutes), or none.",
 )
-@click.option(
-    "--weights", type=click.Path(path_type=str), metavar="DIR", help="Networks that `unshade train` wrote, instead of those that ship."
-)
+@click.option("--weights", type=click.Path(path_type=str), metavar="DIR", help="Networks of `unshade train`, not those that ship.")
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes for several pictures; all cores when not given.")
 @click.option("--resume/--force", default=True, help="Skip pictures that are done with the same settings (the default), or do them again.")
 @output_options
