@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from unshade.errors import UnshadeError
 from unshade.files import write_whole
-from unshade.models.config import Config, ConfigError
+from unshade.models.config import BASELINES, Config, ConfigError
 
 
 class CheckpointError(UnshadeError):
@@ -113,4 +113,5 @@ def _check(path: Path, header: dict[str, str], identity: Identity) -> None:
 
 def _fixed(config: Config, task: str) -> tuple[Any, ...]:
     """What of a configuration cannot change on the way."""
-    return config.size, config.vqvae, config.prior, config.heads, config.training[task].batch
+    own = config.baselines if task in BASELINES else (config.vqvae, config.prior, config.heads)
+    return config.size, own, config.training[task].batch

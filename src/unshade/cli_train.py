@@ -21,8 +21,12 @@ MODELS = ("vqvae", "prior", "heads")
 """What `all` trains, in this order; the names are those of `unshade.train.TASKS`."""
 
 
+BASELINES = ("cnn", "lstm", "transformer")
+
+
 @click.command()
-@click.argument("model", type=click.Choice([*MODELS, "all"]))
+@click.argument("model", type=click.Choice([*MODELS, "baseline", "all"]))
+@click.argument("baseline", type=click.Choice(BASELINES), required=False)
 @click.option(
     "--config", default="small", show_default=True, metavar="NAME", help="small (hours on two cores), paper (a GPU), or tiny (a test)."
 )
@@ -37,6 +41,7 @@ MODELS = ("vqvae", "prior", "heads")
 )
 @click.option("--steps", type=click.IntRange(1), metavar="N", help="Steps in all instead of the configuration's.")
 @click.option("--batch", type=click.IntRange(1), metavar="N", help="Examples of a step and process instead of the configuration's.")
+@click.option("--rate", type=click.FloatRange(0.0, min_open=True), metavar="R", help="Learning rate instead of the configuration's.")
 @click.option(
     "--style", type=click.Choice(["both", "realistic", "toon"]), default="both", show_default=True, help="Which trees to learn from."
 )
@@ -55,19 +60,23 @@ MODELS = ("vqvae", "prior", "heads")
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
 def train(
     model: str,
+    baseline: str | None,
     config: str,
     output: Path,
     steps: int | None,
     batch: int | None,
+    rate: float | None,
     as_json: bool,
     quiet: bool,
     **options: Any,
 ) -> None:
-    """Train the networks of the learned method.
+    """Train the networks of the learned method, or a baseline.
 
     vqvae is the encoder and decoder of node images, prior draws children, heads are the operator, mask and type networks; prior needs a
     trained vqvae. `all` trains each in turn, evaluates it on unseen nodes, and writes weights and a model card to DIR/weights. A call goes
     on where the last one stopped: after Ctrl-C at that step, after a kill at the last save, a minute before at most.
+
+    `baseline` trains what the experiments compare with: the cnn, the lstm or the transformer, or each in turn where none is named.
 
     Several GPUs: torchrun --nproc-per-node 8 -m unshade train vqvae --config paper
 
@@ -75,15 +84,19 @@ def train(
     Examples:
       unshade train all --config small -o run
       unshade train vqvae --config paper --batch 64 -o paper
+      unshade train baseline lstm -o run
     """
     from unshade import train as loop
     from unshade.models.config import find
     from unshade.terminal import Messages
 
+    if baseline and model != "baseline":
+        raise click.UsageError(f"{baseline} is a baseline: unshade train baseline {baseline}")
     check_folder(output)
     found, messages = find(config), Messages(quiet or not loop.leads())
-    for task in MODELS if model == "all" else (model,):
-        run = loop.Run(task, _changed(found, task, steps, batch), output, **options)
+    names = {"all": MODELS, "baseline": (baseline,) if baseline else BASELINES}
+    for task in names.get(model, (model,)):
+        run = loop.Run(task, _changed(found, task, steps, batch, rate), output, **options)
         for progress in loop.train(run):
             _tell(progress, messages, as_json and loop.leads())
     if model == "all" and loop.leads():
@@ -92,10 +105,11 @@ def train(
         messages.say(f"weights and model card: {write_card(output / 'weights')}")
 
 
-def _changed(config: Config, task: str, steps: int | None, batch: int | None) -> Config:
+def _changed(config: Config, task: str, steps: int | None, batch: int | None, rate: float | None) -> Config:
     """The configuration with what the command line says."""
     training = config.training[task]
-    training = dataclasses.replace(training, steps=steps or training.steps, batch=batch or training.batch)
+    given: dict[str, Any] = {"steps": steps, "batch": batch, "learning_rate": rate}
+    training = dataclasses.replace(training, **{name: value for name, value in given.items() if value})
     return dataclasses.replace(config, training={**config.training, task: training})
 
 

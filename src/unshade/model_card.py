@@ -14,6 +14,13 @@ TITLES = {
     "heads": "Heads: operator (f), mask (g) and type (h)",
 }
 
+BASELINES = {
+    "cnn": "CNN baseline: one step at once",
+    "lstm": "LSTM baseline: trees in tokens",
+    "transformer": "Transformer baseline: trees in tokens",
+}
+"""Described where they lie beside the others."""
+
 MEANINGS = {
     "psnr": "PSNR of decoded node images, dB",
     "psnr_worst_tenth": "PSNR that nine nodes in ten reach, dB",
@@ -36,6 +43,11 @@ MEANINGS = {
     "type_balanced_decoded": "the same, mean over the types",
     "mask_iou_decoded": "mask IoU, children decoded from codes",
     "mix_psnr_decoded": "PSNR of the parent mixed by the mask, children decoded from codes, dB",
+    "child_psnr": "PSNR of the children foretold, dB",
+    "nats": "nats a token, against softened targets",
+    "kinds_right": "kinds right, given all tokens before",
+    "structure": "trees with all kinds right",
+    "tree_psnr": "PSNR of the trees written, dB",
 }
 STYLES = ("realistic", "toon")
 
@@ -52,7 +64,7 @@ of real spheres are another distribution, and nothing here says how well it goes
 
 def page(folder: Path) -> str:
     """The card of all weights in a folder, as Markdown. Raises MissingWeightsError, WeightsError."""
-    return HEAD + "".join(_section(name, folder) for name in TITLES if weights.file_of(name, folder).is_file())
+    return HEAD + "".join(_section(name, folder) for name in TITLES | BASELINES if weights.file_of(name, folder).is_file())
 
 
 def write_card(folder: Path) -> Path:
@@ -68,7 +80,7 @@ def _section(name: str, folder: Path) -> str:
     finished = "" if card["steps"] >= card["of"] else f" of {card['of']:,}: not finished"
     made = f"{card['hours']:.1f} hours on {card['hardware']}, precision {card['precision']}, PyTorch {card['torch']}"
     lines = [
-        f"## {TITLES[name]}",
+        f"## {(TITLES | BASELINES)[name]}",
         "",
         f"`{path.name}`, {path.stat().st_size / 2**20:.1f} MiB, configuration `{card['config']}`.",
         "",

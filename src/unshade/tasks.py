@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -23,13 +23,17 @@ from unshade.sphere import SCORED_RADIUS, disc_mask
 from unshade.types import Image
 
 if TYPE_CHECKING:
-    from unshade.synthesis import Batch
+    from unshade.synthesis import Batch, Style
 
 RECONSTRUCTION = 20.0
 """Weight of the mean squared error beside the commitment: about one over the variance of node images."""
 
 SHOWN = 8
 """Examples on a sheet of pictures."""
+
+
+Data = TypeVar("Data")
+"""A batch of what a task learns from: `synthesis.Batch` of most."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class Outcome:
     figures: dict[str, Tensor]
 
 
-class Task(ABC):
+class Task(ABC, Generic[Data]):
     """One training task. Add another by a subclass and a line in `train.TASKS`.
 
     ``config`` gives the sizes, ``folder`` holds the weights of models that were trained before, ``device`` is where it all happens.
@@ -55,16 +59,23 @@ class Task(ABC):
     def build(self) -> nn.Module:
         """The model with fresh weights, from torch's seed."""
 
+    def stream(self, style: Style, split: str, *, batch: int, seed: int, start: int = 0, workers: int = 0) -> Iterator[Data]:
+        """Endless batches from batch ``start``; batch k depends on (style, split, batch, seed, k) alone."""
+        from unshade.synthesis import batches
+
+        options: dict[str, Any] = {"size": self.config.size, "batch": batch, "seed": seed, "start": start, "workers": workers}
+        return cast("Iterator[Data]", batches(style, split, **options, device=self.device))
+
     @abstractmethod
-    def outcome(self, model: nn.Module, batch: Batch) -> Outcome:
+    def outcome(self, model: nn.Module, batch: Data) -> Outcome:
         """The loss of a batch; may draw from torch's seed."""
 
     @abstractmethod
-    def evaluate(self, model: nn.Module, batches: Sequence[Batch]) -> dict[str, float]:
+    def evaluate(self, model: nn.Module, batches: Sequence[Data]) -> dict[str, float]:
         """Figures on unseen nodes; the model is in evaluation mode and gradients are off."""
 
     @abstractmethod
-    def pictures(self, model: nn.Module, batch: Batch) -> Image:
+    def pictures(self, model: nn.Module, batch: Data) -> Image:
         """One sheet (3, H, W) that a person can judge by, in the same conditions."""
 
     def notes(self) -> list[str]:

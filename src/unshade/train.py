@@ -19,6 +19,7 @@ import torch
 from torch import nn
 
 from unshade import checkpoint, processes
+from unshade.baseline_tasks import CNNTask, LSTMTask, TransformerTask
 from unshade.checkpoint import Identity, Position
 from unshade.errors import OutputError, UnshadeError, did_you_mean
 from unshade.models import weights
@@ -28,9 +29,9 @@ from unshade.tasks import HeadsTask, PriorTask, Task, VQVAETask
 from unshade.training_log import Log
 
 if TYPE_CHECKING:
-    from unshade.synthesis import Batch, Style
+    from unshade.synthesis import Style
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (VQVAETask, PriorTask, HeadsTask)}
+TASKS: dict[str, type[Task[Any]]] = {task.name: task for task in (VQVAETask, PriorTask, HeadsTask, CNNTask, LSTMTask, TransformerTask)}
 """Everything that can be trained, each after those whose weights it needs."""
 
 SAVE_EVERY_SECONDS = 60.0
@@ -115,7 +116,7 @@ def train(run: Run) -> Iterator[Progress]:
 
         first, began, earlier = position.step, time.monotonic(), position.seconds
         saved = began
-        for batch in _batches(run, position.step, place):
+        for batch in _batches(run, task, position.step, place):
             mixed = torch.autocast(place.device.type, torch.bfloat16, precision == torch.bfloat16)
             with processes.seeded(run.seed, position.step + 1, place.rank), mixed:
                 outcome = task.outcome(model.train(), batch)
@@ -157,29 +158,23 @@ def learning_rate(training: TrainingConfig, step: int) -> float:
     return training.learning_rate * min(1.0, up, down)
 
 
-def _batches(run: Run, step: int, place: processes.Place) -> Iterator[Batch]:
+def _batches(run: Run, task: Task[Any], step: int, place: processes.Place) -> Iterator[Any]:
     """The batches from a step to the last; another process draws from another seed."""
-    from unshade.synthesis import batches
-
-    training = run.training
     seed = run.seed + 7_919 * place.rank
-    sizes = {"size": run.config.size, "batch": training.batch, "workers": run.workers}
-    stream = batches(run.style, "train", seed=seed, start=step, device=place.device, **sizes)
-    for _ in range(step, training.steps):
+    stream = task.stream(run.style, "train", batch=run.training.batch, seed=seed, start=step, workers=run.workers)
+    for _ in range(step, run.training.steps):
         yield next(stream)
 
 
-def _look(run: Run, task: Task, model: nn.Module, position: Position, log: Log) -> dict[str, float]:
+def _look(run: Run, task: Task[Any], model: nn.Module, position: Position, log: Log) -> dict[str, float]:
     """Figures of unseen nodes, a sheet of pictures, and the weights as they are now."""
-    from unshade.synthesis import batches
-
     count = EVALUATED_LAST if position.step == run.training.steps else EVALUATED
     figures: dict[str, float] = {}
     model.eval()
     with torch.no_grad():
         styles: tuple[Style, ...] = ("realistic", "toon") if run.style == "both" else (run.style,)
         for style in styles:
-            stream = batches(style, "test", size=run.config.size, batch=EVALUATION_BATCH, seed=run.seed, device=task.device)
+            stream = task.stream(style, "test", batch=EVALUATION_BATCH, seed=run.seed)
             found = [next(stream) for _ in range(count)]
             figures |= {f"{style}_{key}": value for key, value in task.evaluate(model, found).items()}
             drawn = task.pictures(model, found[0]).cpu()

@@ -60,6 +60,24 @@ class HeadsConfig:
 
 
 @dataclass(frozen=True)
+class BaselinesConfig:
+    """The baselines, each about as large as the learned method's networks together."""
+
+    cnn_channels: int = 44
+    encoder_channels: int = 24
+    """Of what the LSTM and the transformer see a picture with."""
+    lstm_width: int = 416
+    lstm_layers: int = 2
+    gpt_width: int = 256
+    gpt_layers: int = 6
+    gpt_heads: int = 8
+
+
+BASELINES = ("cnn", "lstm", "transformer")
+"""The tasks that train them."""
+
+
+@dataclass(frozen=True)
 class TrainingConfig:
     """How long and how fast one model trains."""
 
@@ -87,6 +105,7 @@ class Config:
     heads: HeadsConfig
     training: dict[str, TrainingConfig] = field(default_factory=dict)
     """For each task of `unshade.train`."""
+    baselines: BaselinesConfig = BaselinesConfig()
 
     @property
     def bottom(self) -> int:
@@ -114,6 +133,8 @@ class Config:
                 prior=PriorConfig(**data["prior"]),
                 heads=HeadsConfig(**data["heads"]),
                 training={name: TrainingConfig(**value) for name, value in data["training"].items()},
+                # Files from before there were baselines say nothing of them.
+                baselines=BaselinesConfig(**data.get("baselines", {})),
             )
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise ConfigError(f"expected the JSON of a model configuration, got {text[:60]!r} ({error})") from None
@@ -136,6 +157,9 @@ SMALL = Config(
         "vqvae": TrainingConfig(steps=12_000, batch=12, learning_rate=1e-3),
         "prior": TrainingConfig(steps=8_000, batch=16, learning_rate=1e-3, weight_decay=0.01),
         "heads": TrainingConfig(steps=3_000, batch=32, learning_rate=1e-3, weight_decay=0.01),
+        "cnn": TrainingConfig(steps=8_000, batch=16, learning_rate=1e-3, weight_decay=0.01),
+        "lstm": TrainingConfig(steps=8_000, batch=16, learning_rate=1e-3, weight_decay=0.01),
+        "transformer": TrainingConfig(steps=8_000, batch=16, learning_rate=5e-4, weight_decay=0.01),
     },
 )
 """Trains on two cores within hours; its weights ship with the package."""
@@ -150,7 +174,11 @@ PAPER = Config(
         "vqvae": TrainingConfig(steps=200_000, batch=32, learning_rate=3e-4, warmup=1000),
         "prior": TrainingConfig(steps=200_000, batch=16, learning_rate=3e-4, warmup=1000, weight_decay=0.01),
         "heads": TrainingConfig(steps=50_000, batch=32, learning_rate=5e-4, warmup=500, weight_decay=0.01),
+        "cnn": TrainingConfig(steps=200_000, batch=32, learning_rate=5e-4, warmup=1000, weight_decay=0.01),
+        "lstm": TrainingConfig(steps=200_000, batch=32, learning_rate=5e-4, warmup=1000, weight_decay=0.01),
+        "transformer": TrainingConfig(steps=200_000, batch=32, learning_rate=3e-4, warmup=1000, weight_decay=0.01),
     },
+    baselines=BaselinesConfig(184, 48, 1472, 3, 768, 13, 12),
 )
 """The paper's sizes: 256 x 256 images, 2,048 entries, 8 x 8 top and 32 x 32 bottom codes, PixelSNAIL of 256 channels. For a GPU."""
 
@@ -164,7 +192,9 @@ TINY = Config(
         "vqvae": TrainingConfig(steps=30, batch=4, learning_rate=3e-3, warmup=5),
         "prior": TrainingConfig(steps=30, batch=4, learning_rate=3e-3, warmup=5),
         "heads": TrainingConfig(steps=30, batch=4, learning_rate=3e-3, warmup=5),
+        **{name: TrainingConfig(steps=30, batch=4, learning_rate=3e-3, warmup=5) for name in BASELINES},
     },
+    baselines=BaselinesConfig(cnn_channels=8, encoder_channels=8, lstm_width=48, lstm_layers=1, gpt_width=48, gpt_layers=2, gpt_heads=4),
 )
 """Seconds on any machine and of no use: for tests."""
 

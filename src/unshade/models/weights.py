@@ -20,16 +20,24 @@ from torch import nn
 
 from unshade.errors import MissingWeightsError, UnshadeError, did_you_mean
 from unshade.files import write_whole
+from unshade.models.cnn_baseline import CNNBaseline
 from unshade.models.config import Config, ConfigError
 from unshade.models.heads import Heads
+from unshade.models.lstm_baseline import LSTMBaseline
 from unshade.models.prior import Priors
+from unshade.models.transformer_baseline import TransformerBaseline
 from unshade.models.vqvae import VQVAE
 
 FOLDER = Path(__file__).resolve().parent.parent / "weights"
 """Of the weights that ship with the package."""
 
 MODELS: dict[str, Callable[[Config], nn.Module]] = {"vqvae": VQVAE, "prior": Priors, "heads": Heads}
-"""What a file may hold; its name is that of its training task."""
+"""What the learned method needs; the name of a file is that of its training task."""
+
+BASELINES: dict[str, Callable[[Config], nn.Module]] = {"cnn": CNNBaseline, "lstm": LSTMBaseline, "transformer": TransformerBaseline}
+"""What it is compared with."""
+
+_ALL = {**MODELS, **BASELINES}
 
 
 class WeightsError(UnshadeError):
@@ -49,8 +57,8 @@ class Loaded:
 
 def file_of(name: str, folder: str | os.PathLike[str] | None = None) -> Path:
     """Where the weights of a model lie, whether they do or not."""
-    if name not in MODELS:
-        raise WeightsError(f"unknown model {name!r}{did_you_mean(name, MODELS)}")
+    if name not in _ALL:
+        raise WeightsError(f"unknown model {name!r}{did_you_mean(name, _ALL)}")
     return Path(folder or FOLDER) / f"{name}.safetensors"
 
 
@@ -72,9 +80,16 @@ def read_card(path: Path) -> dict[str, Any]:
     return json.loads(_header(path)["card"])
 
 
+def _training(name: str) -> str:
+    """The command that makes the weights of a model."""
+    return f"unshade train baseline {name}" if name in BASELINES else "unshade train all"
+
+
 def _header(path: Path) -> dict[str, str]:
     if not path.is_file():
-        raise MissingWeightsError(f"{path}: no such weights; train them with: unshade train all, or use --method search, which needs none")
+        raise MissingWeightsError(
+            f"{path}: no such weights; train them with: {_training(path.stem)}, or use --method search, which needs none"
+        )
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
@@ -91,7 +106,7 @@ def load(name: str, folder: str | os.PathLike[str] | None = None, device: torch.
     """A trained model in float32.
 
     Args:
-        name: vqvae, prior or heads.
+        name: vqvae, prior, heads, cnn, lstm or transformer.
         folder: of the weight files; None for those that ship.
     Raises:
         MissingWeightsError: there is no such file. WeightsError: it is damaged or of another model.
@@ -102,7 +117,7 @@ def load(name: str, folder: str | os.PathLike[str] | None = None, device: torch.
         raise WeightsError(f"{path}: expected the weights of {name}, got those of {header['model']}")
     try:
         config, card = Config.from_json(header["config"]), json.loads(header["card"])
-        model = MODELS[name](config)
+        model = _ALL[name](config)
         tensors = safetensors.torch.load_file(path)
     except (safetensors.SafetensorError, OSError, ValueError, ConfigError) as error:
         raise WeightsError(f"{path}: the weight file is damaged ({error})") from None
