@@ -284,6 +284,11 @@ def swaps(root: Node) -> list[Node]:
     return found
 
 
+def paints_as_shades(root: Node) -> list[Node]:
+    """Every tree in which a mix of paints has become two-tone shading."""
+    return [found for address, node in walk(root) if node.kind == "mix" for found in _as_shade(root, address, node)]
+
+
 def _as_shade(root: Node, address: str, node: Node) -> list[Node]:
     """What a soft mask or a spot does to the base, done by two-tone shading instead."""
     found = []

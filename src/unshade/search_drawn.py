@@ -7,12 +7,12 @@ shading side by side, then settling it leaf by leaf with its edges hard, down to
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
 from unshade.fit.model import Limits, Model, soften
 from unshade.growth import FLOOR, Candidate, Growth
-from unshade.moves import Anatomy, Proposer, removals, swaps
+from unshade.moves import Anatomy, Proposer, paints_as_shades, removals, swaps
 from unshade.nodes import Node, count_values, find, walk
 
 PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots", "plain_rims")
@@ -37,6 +37,9 @@ UNLIKE = 2.5e-4
 
 LEAST_DESCENT = 0.05
 """Fall of log(error) a value, over two leaves, of plain trees on the way to a drawn picture; photographs give less."""
+
+TWINS = 0.02
+"""Two trees of one form and size whose errors differ by less than this share are taken for one."""
 
 PHOTOGRAPHIC = 1.0e-3
 """A plain tree over this error is given up: the picture was not drawn with one."""
@@ -71,24 +74,32 @@ class DrawnSearch(Growth):
         sharp = self.sharpen(best, PLAIN_LIMITS)
         if sharp.error > PHOTOGRAPHIC:
             return sharp
-        points, dictionary = self.samples.points, self.samples.points_dictionary
-        for grown in self.grow(
-            self.fit(sharp.root, points, effort.growth_steps, limits=PLAIN_LIMITS), points, dictionary, FLOOR, PLAIN, PLAIN_LIMITS
-        ):
-            sharp = grown
-            yield "plain", sharp
-            if sharp.values >= LARGEST_DRAWN:
-                break
-        sharp = self.sharpen(sharp, PLAIN_LIMITS)
-        for step in range(effort.settle_steps):
-            if sharp.error > (SETTLED if step < 5 else 0.15 * SETTLED):
-                break
-            better = self._settle(sharp)
-            if better is None or better.error > max(DRAWN, 1.3 * sharp.error):
-                break
-            sharp = better
+        for sharp in self._settling(sharp, thorough=False):
             yield "settle", sharp
+        if sharp.error < DRAWN:
+            return sharp
+        points, dictionary = self.samples.points, self.samples.points_dictionary
+        grown = self.fit(sharp.root, points, effort.growth_steps, limits=PLAIN_LIMITS)
+        for grown in self.grow(grown, points, dictionary, FLOOR, PLAIN, PLAIN_LIMITS):
+            yield "plain", grown
+            if grown.values >= LARGEST_DRAWN:
+                break
+        if grown.values > sharp.values:
+            sharp = self.sharpen(grown, PLAIN_LIMITS)
+            for sharp in self._settling(sharp, thorough=True):
+                yield "settle", sharp
         return sharp
+
+    def _settling(self, sharp: Candidate, thorough: bool) -> Iterator[Candidate]:
+        """Changes of one leaf, as long as they are better."""
+        for step in range(self.effort.settle_steps):
+            if sharp.error > (SETTLED if step < 5 else 0.15 * SETTLED):
+                return
+            better = self._settle(sharp, thorough)
+            if better is None or better.error > max(DRAWN, 1.3 * sharp.error):
+                return
+            sharp = better
+            yield sharp
 
     def _is_behind(self, leader: Candidate, best: Candidate, curve: list[Candidate]) -> bool:
         rivals = [candidate.error for candidate in curve if candidate.values <= leader.values]
@@ -104,19 +115,22 @@ class DrawnSearch(Growth):
             current = better
         return current
 
-    def _settle(self, current: Candidate) -> Candidate | None:
+    def _settle(self, current: Candidate, thorough: bool) -> Candidate | None:
         """A plain tree with one leaf less, of another kind or in another place, if that is better once its edges are hard."""
         points = self.samples.points
         base = soften(current.root, FINE_SOFTNESS)
         better = self._sharpest(current, [base, *removals(base), *swaps(base)])
-        if better is not None or current.error < FLOOR:
+        if better is not None or current.error < FLOOR or not thorough:
             return better
         proposer = Proposer(self.samples.points_dictionary, points.target, points.weight)
-        moved = []
-        for smaller in [base, *removals(base)]:
-            fitted = fit_pixels(points, smaller, steps=3, softest=FINE_SOFTNESS, limits=PLAIN_LIMITS).root
-            model = Model(fitted, points)
-            moved += [move.root for move in proposer.propose(model, model.layout.pack(fitted), PLAIN, 2)]
+        smaller = []
+        for root in [base, *removals(base)]:
+            fitted = fit_pixels(points, root, steps=3, softest=FINE_SOFTNESS, limits=PLAIN_LIMITS)
+            smaller.append(Candidate(fitted.root, fitted.error))
+        moved = [root for candidate in sorted(smaller, key=settled)[:3] for root in swaps(candidate.root)]
+        for candidate in smaller:
+            model = Model(candidate.root, points)
+            moved += [move.root for move in proposer.propose(model, model.layout.pack(candidate.root), PLAIN, 2)]
         return self._sharpest(current, moved)
 
     def _sharpest(self, current: Candidate, roots: list[Node]) -> Candidate | None:
@@ -163,9 +177,10 @@ class DrawnSearch(Growth):
         options = []
         for state in states:
             model = Model(state.root, self.samples.coarse)
-            for move in proposer.propose(model, model.layout.pack(state.root), families, most):
-                if move.cost <= min(self.effort.max_values, LARGEST_DRAWN) - state.values and form_of(move.root) in RELEASED_FORMS:
-                    options.append(self._coarse(move.root, steps))
+            moves = proposer.propose(model, model.layout.pack(state.root), families, most)
+            for root in [move.root for move in moves] + paints_as_shades(state.root):
+                if count_values(root) <= min(self.effort.max_values, LARGEST_DRAWN) and is_released(root):
+                    options.append(self._coarse(root, steps))
         return options
 
 
@@ -176,6 +191,15 @@ def settled(candidate: Candidate) -> float:
 
 RELEASED_FORMS = {(), ("diffuse",), ("toon_diffuse",), ("toon_diffuse", "toon_diffuse")}
 """Shadings of a base in the released grammar; one toon shading alone is on the way to two."""
+
+
+MOST_MIXES = 3
+"""Mixes in a plain tree: two in the released grammar, and one detour."""
+
+
+def is_released(root: Node) -> bool:
+    """Can a tree of the released grammar grow from this one?"""
+    return form_of(root) in RELEASED_FORMS and sum(node.kind == "mix" for _, node in walk(root)) <= MOST_MIXES
 
 
 def form_of(root: Node) -> tuple[str, ...]:
@@ -194,14 +218,19 @@ def _is_stuck(leaders: list[Candidate]) -> bool:
 def lineages(candidates: list[Candidate], each: int) -> list[Candidate]:
     """The first candidates of every form, so that a wrong shading that fits well early cannot crowd out the right one.
 
-    A form that is `HOPELESS` times worse than the best is left behind.
+    A form that is `HOPELESS` times worse than the best is left behind, and so is a tree as large and as good as one before
+    it, which is nearly always the same tree.
     """
     bar = HOPELESS * min((candidate.error for candidate in candidates), default=0.0)
-    seen: dict[tuple[tuple[str, ...], bool], int] = {}
+    lines: dict[tuple[tuple[str, ...], bool], list[Candidate]] = {}
     chosen = []
     for candidate in candidates:
-        key = form_of(candidate.root), any(node.kind == "rim" for _, node in walk(candidate.root))
-        seen[key] = seen.get(key, 0) + 1
-        if seen[key] <= each and candidate.error <= bar:
+        line = lines.setdefault((form_of(candidate.root), any(node.kind == "rim" for _, node in walk(candidate.root))), [])
+        if len(line) < each and candidate.error <= bar and not any(_are_twins(candidate, other) for other in line):
+            line.append(candidate)
             chosen.append(candidate)
     return chosen
+
+
+def _are_twins(a: Candidate, b: Candidate) -> bool:
+    return a.values == b.values and abs(a.error - b.error) <= TWINS * b.error
