@@ -7,23 +7,38 @@ from pathlib import Path
 
 from unshade.export.glsl import GLSL
 from unshade.export.program import Program, Uniform, program
-from unshade.export.shader_text import by_leaf, encoded, number, picture_comments, printed
+from unshade.export.shader_text import by_leaf, encoded, number, parts, picture_comments
 from unshade.nodes import Tree
 
 HEAD = """\
 shader_type spatial;
 render_mode unshaded;
 
-// Made by unshade. Godot turns picked colours into linear light and shows linear light, so the tree converts at both ends.
+// Made by unshade. Forward+ and Mobile give picked colours as linear light and want linear light back; Compatibility works on
+// sRGB at both ends. The tree converts where its own numbers are of the other kind.
 """
 
 FRAGMENT = """
-void fragment() {
+void fragment() {{
     bool perspective = PROJECTION_MATRIX[3][3] == 0.0;
     vec3 to_eye = perspective ? VIEW : vec3(0.0, 0.0, 1.0);
-    ALBEDO = unshade(seen(normalize(NORMAL), to_eye));
-}
+    vec3 color = unshade(seen(normalize(NORMAL), to_eye), OUTPUT_IS_SRGB);
+    ALBEDO = OUTPUT_IS_SRGB ? {0} : {1};
+}}
 """
+
+PICKED = """\
+// A colour of the inspector as the tree's numbers.
+vec3 picked(vec3 c, bool is_srgb) {{
+    return is_srgb ? {0} : {1};
+}}
+"""
+
+SPACES = {
+    "srgb": (("c", "encode_color(c)"), ("color", "decode_color(color)")),
+    "linear": (("decode_color(c)", "c"), ("encode_color(color)", "color")),
+}
+"""How a tree of each blend space reads a colour, and gives its own, where Godot means sRGB and where it means linear light."""
 
 
 def _declared(uniform: Uniform, made: Program) -> str:
@@ -36,7 +51,8 @@ def _declared(uniform: Uniform, made: Program) -> str:
 
 def godot(made: Program) -> str:
     """The text of a Godot shader."""
-    language = replace(GLSL, color="encode_color({name})" if made.space == "srgb" else "")
+    language = replace(GLSL, color="picked({name}, is_srgb)")
+    reads, gives = SPACES[made.space]
     lines = [HEAD]
     for address, uniforms in by_leaf(made.uniforms):
         lines += [f"group_uniforms {uniforms[0].name.removesuffix('_' + uniforms[0].parameter.name)};  // {address}"]
@@ -44,8 +60,9 @@ def godot(made: Program) -> str:
     lines += ["group_uniforms;"] * bool(made.uniforms)
     for picture in made.pictures:
         lines.append(f"uniform sampler2D {picture.name} : filter_linear, repeat_enable;  // {picture.address}; the PNG is at the end")
-    text = printed(made, language, "linear", "seen", *(["encode_color"] if language.color else []))
-    return "\n".join([*lines, "", text + FRAGMENT, *picture_comments(made.pictures, GLSL), ""])
+    functions, main = parts(made, language, made.space, "encode_color", "decode_color", "seen", extra=["bool is_srgb"])
+    text = "\n\n".join([*functions, PICKED.format(*reads), main]) + "\n" + FRAGMENT.format(*gives)
+    return "\n".join([*lines, "", text, *picture_comments(made.pictures, GLSL), ""])
 
 
 def write(tree: Tree, path: Path) -> None:

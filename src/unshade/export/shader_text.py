@@ -107,13 +107,19 @@ class Printer:
         return f"{known}({', '.join(texts)})"
 
 
-def printed(program: Program, language: Language, space: Space, *others: str, extra: Iterable[str] = ()) -> str:
-    """All functions of a program, its own last; ``others`` are functions that the frame around it calls."""
+def parts(program: Program, language: Language, space: Space, *others: str, extra: Iterable[str] = ()) -> tuple[list[str], str]:
+    """The functions that a program calls, and its own; ``others`` are functions that the frame around it calls."""
     printer = Printer(language)
     main = Printer(language, {item.name: _read(item, language) for item in program.uniforms})
-    parts = [printer.function(function) for function in program.functions(space, *others)]
+    functions = [printer.function(function) for function in program.functions(space, *others)]
     comments = [statement.comment for statement in program.statements]
-    return "\n\n".join([*parts, main.function(program.main(space), comments, extra)]) + "\n"
+    return functions, main.function(program.main(space), comments, extra)
+
+
+def printed(program: Program, language: Language, space: Space, *others: str, extra: Iterable[str] = ()) -> str:
+    """`parts` as one text."""
+    functions, main = parts(program, language, space, *others, extra=extra)
+    return "\n\n".join([*functions, main]) + "\n"
 
 
 def _read(uniform: Uniform, language: Language) -> str:

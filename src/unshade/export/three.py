@@ -50,19 +50,26 @@ void main() {
     #include <colorspace_fragment>
 }`;
 
-const waiting = [];
+const textures = {};
 
-/** Resolves when the pictures of the tree have been read. */
-export const ready = Promise.resolve().then(() => Promise.all(waiting));
-
-function load(url) {
+function load(texture, url) {
   return new Promise((resolve, reject) => {
     const image = new Image();
-    image.onload = () => resolve(image);
+    image.onload = () => { texture.image = image; texture.needsUpdate = true; resolve(); };
     image.onerror = reject;
     image.src = url;
   });
 }
+
+/** Resolves when the pictures of the tree have been read. */
+export const ready = Promise.all(Object.entries(pictures).map(([name, url]) => {
+  const texture = textures[name] = new THREE.Texture();
+  Object.assign(texture, {
+    flipY: false, generateMipmaps: false, colorSpace: THREE.NoColorSpace,
+    minFilter: THREE.LinearFilter, magFilter: THREE.LinearFilter, wrapS: THREE.RepeatWrapping, wrapT: THREE.RepeatWrapping,
+  });
+  return load(texture, url);
+}));
 
 export function createMaterial() {
   const uniforms = {};
@@ -72,15 +79,7 @@ export function createMaterial() {
         : type === "float" ? value : new THREE.Vector3(...value),
     };
   }
-  for (const [name, url] of Object.entries(pictures)) {
-    const texture = new THREE.Texture();
-    Object.assign(texture, {
-      flipY: false, generateMipmaps: false, colorSpace: THREE.NoColorSpace,
-      minFilter: THREE.LinearFilter, magFilter: THREE.LinearFilter, wrapS: THREE.RepeatWrapping, wrapT: THREE.RepeatWrapping,
-    });
-    uniforms[name] = { value: texture };
-    waiting.push(load(url).then((image) => { texture.image = image; texture.needsUpdate = true; }));
-  }
+  for (const [name, texture] of Object.entries(textures)) uniforms[name] = { value: texture };
   return new THREE.ShaderMaterial({ uniforms, vertexShader, fragmentShader, toneMapped: false });
 }
 """
