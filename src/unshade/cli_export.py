@@ -19,8 +19,9 @@ def _click_option(option: Option) -> Callable[[Any], Any]:
         "integer": click.IntRange(option.low, option.high),
         "file": click.Path(path_type=Path),
         "word": click.Choice(option.words),
+        "text": click.STRING,
     }[option.type]
-    metavar = {"integer": "N", "file": "FILE", "word": None}[option.type]
+    metavar = {"integer": "N", "file": "FILE", "word": None, "text": "TEXT"}[option.type]
     return click.option(f"--{option.name}", type=kind, metavar=metavar, help=f"{option.meaning} Of {takers}.")
 
 
@@ -60,6 +61,7 @@ def export(tree: str, name: str | None, output: Path, quiet: bool, **options: An
       unshade export --list
       unshade export out/ball -o matcap.png --size 1024
       unshade export out/ball --to png -o matcap.png --bits 16
+      unshade export out/ball -o heart.svg --shape drawing.svg --region heart
     """
     from unshade.export import ExportWarning
     from unshade.export import export as write

@@ -32,7 +32,7 @@ class Option:
 
     name: str
     meaning: str
-    type: Literal["integer", "file", "word"]
+    type: Literal["integer", "file", "word", "text"]
     low: int = 0
     high: int = 0
     words: tuple[str, ...] = ()
@@ -44,6 +44,8 @@ OPTIONS = {
         Option("size", "Width and height in pixels.", "integer", 1, 8192),
         Option("bits", "Bits a channel.", "word", words=("8", "16")),
         Option("padding", "Pixels between the silhouette and the edge of the picture.", "integer", 0, 4096),
+        Option("shape", "An SVG with a closed path to be shaded in the sphere's place.", "file"),
+        Option("region", "The id of the path, where the SVG has several.", "text"),
     )
 }
 
@@ -84,6 +86,13 @@ def linear(tree: Tree) -> list[str]:
 PICTURE = Loss("nodes", "the tree becomes one picture, as one asks for", lambda tree: [])
 """Of targets that are pictures: said in the table, not warned about."""
 
+EMBEDDED = Loss("a raster leaf as vectors", "it is embedded as a picture of 512 pixels", of_kinds("image", "image_mask", "environment_map"))
+ENCODED = Loss(
+    "operators that work on linear light",
+    "each leaf is encoded for itself and blended so: a multiply looks nearly the same, a screen or a soft mix lighter or darker",
+    linear,
+)
+
 TARGETS = {
     target.name: target
     for target in (
@@ -95,6 +104,26 @@ TARGETS = {
             (PICTURE,),
             "Pillow",
             ("size", "bits", "padding"),
+        ),
+        Target(
+            "svg",
+            (".svg",),
+            "vector art: gradients, paths, masks and blend modes in groups named as the nodes",
+            "svg.write_svg",
+            (EMBEDDED, ENCODED),
+            "Chromium and resvg",
+            ("size", "shape", "region"),
+            needs="svgelements (for a shape)",
+        ),
+        Target(
+            "pdf",
+            (".pdf",),
+            "vector art: shadings, soft masks and blend modes in layers named as the nodes",
+            "pdf.write_pdf",
+            (EMBEDDED, ENCODED),
+            "PDFium and Poppler",
+            ("size", "shape", "region"),
+            needs="pikepdf; svgelements (for a shape)",
         ),
     )
 }
