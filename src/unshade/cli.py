@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from unshade import __version__, batch, cli_dataset, cli_edit, cli_export, cli_extract, cli_relight, cli_train, cli_transfer
+from unshade import __version__, batch, cli_verbs
 from unshade.arguments import SEED, output_options, read_document, read_tree
 from unshade.errors import TreeError, UnshadeError
 from unshade.staging import check_folder
@@ -427,7 +427,7 @@ def bench() -> None:
     raise AssertionError("`Verbs` puts the real command in the place of this one")
 
 
-for _verb in (*cli_dataset.VERBS, *cli_edit.VERBS, *cli_export.VERBS, *cli_extract.VERBS, *cli_relight.VERBS, *cli_train.VERBS, *cli_transfer.VERBS):
+for _verb in cli_verbs.VERBS:
     cli.add_command(_verb)
 
 

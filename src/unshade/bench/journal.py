@@ -7,6 +7,7 @@ change of the code, ask for a fresh run. The journal holds trees, so it stays ou
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +18,16 @@ Row = dict[str, Any]
 KEY = ("dataset", "name", "method", "seed", "perceptual")
 
 
-def key_of(row: Row) -> tuple[Any, ...]:
+def key_of(row: Row, fields: Sequence[str] = KEY) -> tuple[Any, ...]:
     """What was asked."""
-    return tuple(row[field] for field in KEY)
+    return tuple(row[field] for field in fields)
 
 
 class Journal:
     """The file of rows; the last row of a key counts."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, fields: Sequence[str] = KEY) -> None:
+        self.path, self.fields = path, fields
         self.rows: dict[tuple[Any, ...], Row] = {}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -36,20 +37,20 @@ class Journal:
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
         for line in text.splitlines():
-            row = _parse(line)
+            row = _parse(line, fields)
             if row is not None:
-                self.rows[key_of(row)] = row
+                self.rows[key_of(row, fields)] = row
 
     def add(self, row: Row) -> None:
         """Keep a row, at once."""
-        self.rows[key_of(row)] = row
+        self.rows[key_of(row, self.fields)] = row
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 
 
-def _parse(line: str) -> Row | None:
+def _parse(line: str, fields: Sequence[str]) -> Row | None:
     try:
         row = json.loads(line)
     except json.JSONDecodeError:
         return None
-    return row if isinstance(row, dict) and all(field in row for field in KEY) else None
+    return row if isinstance(row, dict) and all(field in row for field in fields) else None

@@ -1,6 +1,7 @@
 """The CNN baseline: one step of the tree as one picture-to-picture network, applied again to its own children.
 
-After Niu et al. 2022, "RIM-Net: Recursive Implicit Fields for Unsupervised Learning of Hierarchical Shape Structures". It does what the priors, f, g and h do together, but once and for all: it has one answer where several trees are possible.
+After Niu et al. 2022, "RIM-Net: Recursive Implicit Fields for Unsupervised Learning of Hierarchical Shape Structures". It does what
+the priors, f, g and h do together, but once and for all: it has one answer where several trees are possible.
 """
 
 from __future__ import annotations

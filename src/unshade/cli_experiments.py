@@ -1,0 +1,93 @@
+"""The command `unshade experiments`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from unshade.arguments import SEED
+from unshade.errors import UnshadeError
+from unshade.staging import check_folder
+
+PARTS = ("decomposition", "analogy", "ablation", "robustness", "anytime", "wild")
+"""As in `unshade.experiments.options`, which comes with PyTorch."""
+
+
+class ExperimentsError(UnshadeError):
+    """Some measurements failed."""
+
+    exit_code = 7
+
+
+@click.command()
+@click.argument("parts", nargs=-1, type=click.Choice(PARTS), metavar="[PART]...")
+@click.option(
+    "--method",
+    "methods",
+    multiple=True,
+    metavar="NAME",
+    help="cnn, lstm, transformer (and NAME+fit), learned, search:PRESET, hybrid:PRESET; may be repeated. Default: all.",
+)
+@click.option("--limit", type=click.IntRange(1), metavar="N", help="Pictures of each set, and analogies of each component.")
+@click.option("--resume/--fresh", default=True, help="Keep what an earlier run has measured (the default), or measure again.")
+@click.option(
+    "--data",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    metavar="DIR",
+    help="Folder of the real spheres, as for `bench`.",
+)
+@click.option(
+    "--weights",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Of networks and baselines, instead of those that ship.",
+)
+@click.option(
+    "--training",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    metavar="DIR",
+    help="A training run, whose learning curves are kept.",
+)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("."), show_default=True, metavar="DIR", help="Root of the project."
+)
+@click.option("--seed", type=SEED, default=0, show_default="0", metavar="N", help="Of the methods and of the test trees.")
+@click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes; all cores when not given.")
+@click.option("--perceptual/--no-perceptual", default=True, help="Measure st_lpips too, about a second a picture (the default).")
+def experiments(
+    parts: tuple[str, ...],
+    methods: tuple[str, ...],
+    limit: int | None,
+    resume: bool,
+    data: Path | None,
+    weights: Path | None,
+    training: Path | None,
+    output: Path,
+    seed: int,
+    workers: int | None,
+    perceptual: bool,
+) -> None:
+    """Run the paper's experiments and ours, all or some: from raw data to DIR/docs/experiments.md.
+
+    decomposition compares all methods, analogy asks each for 300 edits a component by example, ablation takes the learned method apart,
+    robustness spoils the pictures and looks at size, anytime looks at the trees on the way, wild shows what has no known tree. The
+    JSON behind the page goes to DIR/benchmarks/results/experiments. Data and weights that are not there are skipped by name. It can
+    be interrupted and goes on where it was.
+
+    \b
+    Examples:
+      unshade experiments
+      unshade experiments decomposition anytime --limit 4
+      unshade experiments analogy --method search:balanced --method lstm --weights run/weights
+    """
+    from unshade.experiments import Options, run
+    from unshade.experiments.options import METHODS
+
+    check_folder(output)
+    ran = run(Options(parts or PARTS, methods or METHODS, data, output, limit, weights, training, seed, workers, perceptual, resume))
+    if ran.failed:
+        raise ExperimentsError(f"{len(ran.failed)} measurements failed; the first: {ran.failed[0]}")
+
+
+VERBS = (experiments,)

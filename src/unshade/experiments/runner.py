@@ -1,0 +1,138 @@
+"""Runs the parts, one after the other, and writes documents, figures and the page after each."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+
+from unshade.bench.options import cores
+from unshade.bench.report import machine, versions
+from unshade.errors import MissingExtraError, OutputError, UnshadeError, did_you_mean
+from unshade.experiments import methods, plots, sheets
+from unshade.experiments.jobs import Work
+from unshade.experiments.options import Options
+from unshade.experiments.page import page
+from unshade.experiments.parts import PARTS, Context, Document
+from unshade.files import write_whole
+from unshade.models import perceptual
+
+
+@dataclass
+class Ran:
+    """What a run came to."""
+
+    documents: dict[str, Document] = field(default_factory=dict)
+    """Of the parts that ran now."""
+    skipped: dict[str, str] = field(default_factory=dict)
+    """Method or measure -> why it was left out."""
+    failed: list[str] = field(default_factory=list)
+
+
+def run(options: Options, console: Console | None = None) -> Ran:
+    """Run the parts that are asked for.
+
+    An interrupt keeps all that is measured; a later call goes on there.
+
+    Raises:
+        UnshadeError: an unknown part or method, nothing that can run, or an output that cannot be written.
+        KeyboardInterrupt: it was interrupted.
+    """
+    console = console or Console(stderr=True)
+    ran = Ran()
+
+    def tell(text: str) -> None:
+        console.print(text, markup=False, highlight=False)
+
+    for part in options.parts:
+        if part not in PARTS:
+            raise UnshadeError(f"unknown experiment {part!r}{did_you_mean(part, PARTS)}")
+    able = []
+    for method in dict.fromkeys(options.methods):
+        why = methods.missing(method, options.weights)
+        if why is None:
+            able.append(method)
+        else:
+            ran.skipped[method] = why
+    if not able:
+        raise UnshadeError(f"no method can run; {'; '.join(f'{name}: {why}' for name, why in ran.skipped.items()) or 'none was asked for'}")
+    measured = _perceptual(options, ran)
+    for name, why in ran.skipped.items():
+        tell(f"skipped {name}: {why}")
+    work = Work(options.journal, options.workers or cores(), options.resume, console)
+    for part in options.parts:
+        tell(f"{part}: {', '.join(able)}")
+        context = Context(options, able, work.measure, measured)
+        before = len(work.failed)
+        document, rows = PARTS[part](context)
+        failed = work.failed[before:]
+        for what in [*(f"skipped {name}: {why}" for name, why in context.skipped.items()), *(f"failed: {what}" for what in failed)]:
+            tell(what)
+        head: Document = {"part": part, "seed": options.seed, "limit": options.limit, "machine": machine(), "versions": versions()}
+        head |= {"weights": methods.cards(iter(able), options.weights), "skipped": ran.skipped | context.skipped, "failed": failed}
+        ran.documents[part] = head | document
+        ran.failed += failed
+        _write(options.results / f"{part}.json", json.dumps(ran.documents[part], indent=1) + "\n")
+        if part in sheets.SHEETS:
+            sheets.SHEETS[part](options, rows)
+        _draw(lambda part=part: _plot(options, part, ran.documents[part]), tell)  # type: ignore[misc]
+        _learning(options, tell)
+        write_page(options)
+    return ran
+
+
+def _perceptual(options: Options, ran: Ran) -> bool:
+    """Whether st_lpips is measured."""
+    if not options.perceptual:
+        return False
+    try:
+        perceptual.weight_file()
+    except MissingExtraError as error:
+        ran.skipped["st_lpips"] = str(error)
+        return False
+    return True
+
+
+def _plot(options: Options, part: str, document: Document) -> None:
+    if part == "anytime":
+        plots.anytime(document, options.figures / "anytime.png")
+    if part == "robustness":
+        plots.robustness(document, options.figures / "robustness.png")
+        plots.size(document, options.figures / "size.png")
+
+
+def _learning(options: Options, tell: Callable[[str], None]) -> None:
+    """Keep the logs of a training run, and draw those that are kept."""
+    kept = options.results / "learning"
+    if options.training is not None:
+        kept.mkdir(parents=True, exist_ok=True)
+        for log in sorted(options.training.glob("*/log.jsonl")):
+            shutil.copyfile(log, kept / f"{log.parent.name}.jsonl")
+    if kept.is_dir():
+        _draw(lambda: plots.learning(kept, options.figures / "learning.png"), tell)
+
+
+def _draw(draw: Callable[[], object], tell: Callable[[str], None]) -> None:
+    try:
+        draw()
+    except MissingExtraError as error:
+        tell(f"not drawn: {error}")
+
+
+def write_page(options: Options) -> None:
+    """The page of all documents that there are, whenever they were made. Raises OutputError."""
+    paths = [options.results / f"{part}.json" for part in PARTS]
+    documents = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths if path.is_file()}
+    _write(options.page, page(options, documents))
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path.parent}: cannot be made: {error.strerror or error}") from None
+    write_whole(path, text.encode())
