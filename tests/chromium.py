@@ -54,10 +54,9 @@ for (const [name, job] of Object.entries(jobs)) {
       const image = new Image();
       image.src = picture;
       await image.decode();
-      const bitmap = await createImageBitmap(image, { colorSpaceConversion: "none" });
+      const bitmap = await createImageBitmap(image, { colorSpaceConversion: "none", imageOrientation: job.flipped ? "flipY" : "none" });
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-      gl.pixelStorei(gl.UNPACK_FLIP_Y_WEBGL, job.flipped);
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, bitmap);
       for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.LINEAR);
       gl.uniform1i(gl.getUniformLocation(program, uniform), unit++);

@@ -35,7 +35,7 @@ def mirrored(n: vec3) -> vec3:
 
 def turned(v: vec3, rotation: vec3) -> vec3:
     """A vector turned by an axis-angle vector in radians."""
-    angle: float = max(length(rotation), 0.000000000001)
+    angle: float = max(length(rotation), 0.000001)
     axis: vec3 = rotation / angle
     return v * cos(angle) + cross(axis, v) * sin(angle) + axis * (dot(axis, v) * (1.0 - cos(angle)))
 
