@@ -301,7 +301,8 @@ def _as_shade(root: Node, address: str, node: Node) -> list[Node]:
             found.append((replace(root, address, bright), edge["direction"], edge["threshold"][0] - 0.5 * softness, softness, ambient))
     elif isinstance(node, Leaf) and node.kind == "toon_highlight" and address.rsplit(".", 2)[0] in Anatomy.of(root).forms:
         start = math.cos(min(node["radius"][0], math.pi)) - 0.05
-        found.append((replace(root, address, None), node["direction"], start, 0.1, 0.5))
+        for gone in (address, address.rsplit(".", 2)[0]):  # the spot alone, or with the form that it lies on
+            found.append((replace(root, gone, None), node["direction"], start, 0.1, 0.5))
     shaded = []
     for kept, direction, start, softness, ambient in found:
         base = Anatomy.of(kept).base

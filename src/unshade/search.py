@@ -10,7 +10,7 @@ from unshade.fit.pixels import Pixels
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
 from unshade.moves import removals, swaps
 from unshade.nodes import count_values
-from unshade.search_drawn import DRAWN, DrawnSearch
+from unshade.search_drawn import DRAWN, DrawnSearch, looks_drawn
 
 ALL = ("lights", "masks", "shades", "spots", "rims", "environments")
 """Every family of leaves."""
@@ -59,8 +59,8 @@ class Search(Growth):
                 current = better
                 yield "exchange", current
         current = self.sharpen(current)
-        if self.effort.beam and self.complete and current.error < DRAWN:
-            current = DrawnSearch(self.samples, self.effort).prune(current, 6)
+        if self.effort.beam and self.complete and looks_drawn(current):
+            current = DrawnSearch(self.samples, self.effort).prune(current)
         if plain and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
             current = plain
         yield "polish", current

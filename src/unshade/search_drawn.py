@@ -10,10 +10,10 @@ import math
 from collections.abc import Generator, Iterator
 
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
-from unshade.fit.model import Limits, Model, soften
+from unshade.fit.model import NO_LIMITS, Limits, Model, is_hard, soften
 from unshade.growth import FLOOR, Candidate, Growth
 from unshade.moves import Anatomy, Proposer, paints_as_shades, removals, swaps
-from unshade.nodes import Node, count_values, find, walk
+from unshade.nodes import Leaf, Node, count_values, find, walk
 
 PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots", "plain_rims")
 """The families of the released grammar: all lights grey, edges drawn."""
@@ -105,12 +105,12 @@ class DrawnSearch(Growth):
         rivals = [candidate.error for candidate in curve if candidate.values <= leader.values]
         return min(leader.error, best.error) > (1.8 if leader.values < 26 else 1.4) * min(rivals, default=math.inf)
 
-    def prune(self, current: Candidate, most: int) -> Candidate:
-        """A tree that reproduces a drawn picture, without what is only there to mend a few pixels."""
-        for _ in range(most):
+    def prune(self, current: Candidate) -> Candidate:
+        """Any tree that reproduces a drawn picture, without what is only there to mend a few pixels."""
+        for _ in range(self.effort.settle_steps):
             base = soften(current.root, FINE_SOFTNESS)
-            better = self._sharpest(current, [base, *removals(base), *swaps(base)])
-            if better is None or better.error > DRAWN:
+            better = self._sharpest(current, [base, *removals(base), *swaps(base)], NO_LIMITS)
+            if better is None or better.error > max(DRAWN, current.error):
                 break
             current = better
         return current
@@ -133,21 +133,21 @@ class DrawnSearch(Growth):
             moved += [move.root for move in proposer.propose(model, model.layout.pack(candidate.root), PLAIN, 2)]
         return self._sharpest(current, moved)
 
-    def _sharpest(self, current: Candidate, roots: list[Node]) -> Candidate | None:
+    def _sharpest(self, current: Candidate, roots: list[Node], limits: Limits = PLAIN_LIMITS) -> Candidate | None:
         """The best of some trees by a short soft fit, then a sharp one of the most promising; None if none is better."""
         points = self.samples.points
-        start = fit_pixels(points, soften(current.root, FINE_SOFTNESS), steps=4, softest=FINE_SOFTNESS, limits=PLAIN_LIMITS).error
+        start = fit_pixels(points, soften(current.root, FINE_SOFTNESS), steps=4, softest=FINE_SOFTNESS, limits=limits).error
         options = []
         for root in roots:
             if count_values(root) <= self.effort.max_values:
-                quick = fit_pixels(points, root, steps=4, softest=FINE_SOFTNESS, limits=PLAIN_LIMITS)
+                quick = fit_pixels(points, root, steps=4, softest=FINE_SOFTNESS, limits=limits)
                 options.append(Candidate(quick.root, quick.error))
         options.sort(key=settled)
         smaller = [option for option in options if option.values < current.values and option.error < 1.5 * start + 1e-5]
         options = smaller[:6] + [option for option in options if option not in smaller][:6]
         best, bar = None, settled(current) - 2e-3
         for option in options:
-            fitted = sharpen(self.samples.fine, option.root, steps=12, limits=PLAIN_LIMITS)
+            fitted = sharpen(self.samples.fine, option.root, steps=12, limits=limits)
             found = Candidate(fitted.root, fitted.error)
             if settled(found) < bar:
                 best, bar = found, settled(found)
@@ -182,6 +182,12 @@ class DrawnSearch(Growth):
                 if count_values(root) <= min(self.effort.max_values, LARGEST_DRAWN) and is_released(root):
                     options.append(self._coarse(root, steps))
         return options
+
+
+def looks_drawn(candidate: Candidate) -> bool:
+    """Is a tree so near, or so near and with hard edges, that the picture was drawn?"""
+    edges = any(isinstance(node, Leaf) and is_hard(node) for _, node in walk(candidate.root))
+    return candidate.error < (4.0 * DRAWN if edges else DRAWN)
 
 
 def settled(candidate: Candidate) -> float:
