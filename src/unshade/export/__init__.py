@@ -24,7 +24,7 @@ class ExportWarning(UserWarning):
 def degradations(tree: Tree, target: str | Target) -> list[str]:
     """What of this tree the target cannot hold, one sentence each with the addresses; also that a target is experimental."""
     target = target if isinstance(target, Target) else target_of(target)
-    found = [f"{target.name} is experimental: no program has checked it"] if target.experimental else []
+    found = [f"{target.name} is experimental: {target.short_of or 'no program has checked it'}"] if target.experimental else []
     for loss in target.losses:
         places = loss.where(tree)
         if places:

@@ -66,6 +66,8 @@ class Target:
     options: tuple[str, ...] = ()
     needs: str = ""
     """The optional libraries that writing it takes, as one names them to pip."""
+    short_of: str = ""
+    """Of an experimental target: what was checked all the same, short of its own program."""
 
     @property
     def experimental(self) -> bool:
@@ -86,12 +88,16 @@ def linear(tree: Tree) -> list[str]:
 PICTURE = Loss("nodes", "the tree becomes one picture, as one asks for", lambda tree: [])
 """Of targets that are pictures: said in the table, not warned about."""
 
-EMBEDDED = Loss("a raster leaf as vectors", "it is embedded as a picture of 512 pixels", of_kinds("image", "image_mask", "environment_map"))
+RASTERS = of_kinds("image", "image_mask", "environment_map")
+EMBEDDED = Loss("a raster leaf as vectors", "it is embedded as a picture of 512 pixels", RASTERS)
 ENCODED = Loss(
     "operators that work on linear light",
     "each leaf is encoded for itself and blended so: a multiply looks nearly the same, a screen or a soft mix lighter or darker",
     linear,
 )
+BOUND = Loss("the picture of a leaf", "it becomes a texture to bind by hand, as PNG data in a comment at the end", RASTERS)
+BESIDE = Loss("the picture of a leaf in a .mtlx", "it must stand beside it as a PNG; a .zip brings it along", lambda tree: [])
+"""Said by the writer, which knows the suffix."""
 
 TARGETS = {
     target.name: target
@@ -124,6 +130,42 @@ TARGETS = {
             "PDFium and Poppler",
             ("size", "shape", "region"),
             needs="pikepdf; svgelements (for a shape)",
+        ),
+        Target("glsl", (".glsl",), "a function of the normal, parameters as uniforms", "glsl.write", (BOUND,), "Chromium and glslang"),
+        Target("wgsl", (".wgsl",), "a function of the normal and a structure of parameters", "wgsl.write", (BOUND,), "naga (wgpu)"),
+        Target(
+            "three",
+            (".html", ".js"),
+            "a page that runs offline with a control for every parameter; a module",
+            "three.write",
+            (),
+            "Chromium",
+        ),
+        Target("godot", (".gdshader",), "a spatial shader, parameters in the inspector", "godot.write", (BOUND,), "Godot 4.6 (web build)"),
+        Target(
+            "unity",
+            (".shader",),
+            "ShaderLab with HLSL, parameters in the inspector",
+            "unity.write",
+            (BOUND,),
+            short_of="glslang compiles its HLSL and Chromium renders that; Unity has not opened it",
+        ),
+        Target(
+            "blender",
+            (".py", ".blend"),
+            "a node group driven by normals, a ranged socket for every parameter",
+            "blender.write",
+            (),
+            "Blender 5.0, Cycles on the CPU",
+            needs="Blender or bpy (for a .blend)",
+        ),
+        Target(
+            "materialx",
+            (".mtlx", ".zip"),
+            "a node graph with an interface, the formulas as node definitions",
+            "materialx.write",
+            (BESIDE,),
+            "MaterialX 1.39 and Chromium",
         ),
     )
 }
