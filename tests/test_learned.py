@@ -100,6 +100,16 @@ def test_a_node_whose_every_sample_is_bad_is_left_over(networks: Networks) -> No
     assert pool.left_over == [0]
 
 
+def test_a_pool_has_a_largest_size(networks: Networks) -> None:
+    def forever(*images: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.one_hot(torch.zeros(len(images[-1]), dtype=torch.int64), 8).float()
+
+    heads: Any = SimpleNamespace(operator=networks.heads.operator, mask=networks.heads.mask, types=forever)
+    endless = dataclasses.replace(networks, heads=heads)
+    (pool,) = pools(endless, dataclasses.replace(SETTINGS, depth=9, nodes=5))[-1].pools
+    assert [part.state for part in pool.parts].count("split") == 5 and len(pool.left_over) == 6
+
+
 def test_more_samples_never_choose_a_worse_one(networks: Networks) -> None:
     settings = dataclasses.replace(SETTINGS, samples=8)
     image = node_image(picture(SIMPLE), disc_mask(96), 16)
@@ -127,7 +137,7 @@ def test_several_pools_differ_and_the_best_comes_first(networks: Networks) -> No
 def terms(parent: torch.Tensor, left: torch.Tensor, right: torch.Tensor, operator: str, mask: torch.Tensor | None = None) -> Terms:
     masks = torch.zeros(1, 1, SIZE, SIZE) if mask is None else mask[None]
     number = torch.tensor([synthesis.OPERATORS.index(operator)])
-    return criterion(parent[None], left[None], right[None], number, masks, Inference())[0]
+    return criterion(parent[None], parent[None], left[None], right[None], number, masks, Inference())[0]
 
 
 def test_the_criterion_of_a_right_decomposition_is_nothing() -> None:

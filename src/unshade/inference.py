@@ -15,6 +15,7 @@ below the depth limit. Where the paper's text has slips, or says less than a pro
   highlight, nearly blank, can never win. Here the distance is cut to [`LEAST`, `SEEN`] and divided by `SEEN`: a child that is
   visibly different costs nothing, one that is not costs up to ``log(SEEN / LEAST)``.
 - Blank and white are looked for in *encodings*, where 0 and 1 mean nothing of the kind. Here they are looked for in the pictures.
+- A child is compared with the parent as it comes out of its own codes, because a copy of the parent comes out of codes too.
 - A black or a white child is of no use under multiply and screen, but is a paint like any other under a mix.
 - Distances are root mean squares inside the disc, so that alpha, beta, gamma and tau do not depend on the size of the pictures.
 - g's mask is used as soft as it comes, because our Toon trees hold ramps; the paper's masks are 0 or 1.
@@ -46,8 +47,9 @@ from unshade.sphere import disc_mask
 from unshade.synthesis import OPERATORS, TYPES
 from unshade.types import Image, Mask
 
-SEEN = 0.05
-"""Root mean square difference from which on two pictures are visibly different."""
+SEEN = 0.02
+"""Root mean square difference from which on two decoded pictures are visibly different. Leaves of our trees change a picture by
+0.008 at least."""
 
 LEAST = 1e-3
 """Smallest difference whose logarithm is taken."""
@@ -61,7 +63,9 @@ class Inference:
     """T, drawn of each node."""
     temperature: float = 1.0
     depth: int = 5
-    """Levels of operators; a node that is still none below them is left over."""
+    """Levels of operators; a node that is not a leaf below them is left over."""
+    nodes: int = 16
+    """Most nodes of a pool that are decomposed, more than any tree of the released grammar has; the rest is left over."""
     similar: float = 0.02
     """alpha"""
     blank: float = 0.02
@@ -209,23 +213,22 @@ def node_image(image: Image, valid: Mask, size: int) -> Image:
         (3, size, size), 0 outside the disc.
     """
     weight = (valid & disc_mask(image.shape[-1], device=image.device)).to(image)
-    side = image.shape[-1]
-    # From coarse to fine: what a fine average does not know, the coarser one has.
-    filled = (image * weight).sum((1, 2), keepdim=True) / weight.sum().clamp(min=1.0)
-    for step in (4, 8, 16, 32, 64, 128, 256, 512):
-        level = min(step, size)
-        if level <= side:
-            share = F.adaptive_avg_pool2d(weight[None], level)
-            mean = F.adaptive_avg_pool2d((image * weight)[None], level) / share.clamp(min=1e-6)
-        else:
-            share, mean = (F.interpolate(part[None], level, mode="bilinear") for part in (weight, image * weight))
-            mean = mean / share.clamp(min=1e-6)
-        below = F.interpolate(filled[None], level, mode="bilinear") if filled.shape[-1] > 1 else filled[None]
-        trust = (4.0 * share).clamp(max=1.0)
-        filled = (trust * mean + (1.0 - trust) * below)[0]
-        if level == size:
-            break
-    return filled.clamp(0.0, 1.0) * disc_mask(size, device=image.device)
+    layers = torch.cat([image * weight, weight])[None]
+    filled = (layers[0, :3].sum((1, 2)) / weight.sum().clamp(min=1.0)).view(1, 3, 1, 1)
+    # From coarse to fine: what a finer average does not know, the coarser one does.
+    for level in (side for side in (4, 8, 16, 32) if side < size and side <= image.shape[-1]):
+        filled = _over(F.adaptive_avg_pool2d(layers, level), filled)
+    # The networks were shown pictures that are sampled at pixel centres, their edges as sharp as can be.
+    filled = _over(F.interpolate(layers, size, mode="bilinear"), filled)
+    return filled[0].clamp(0.0, 1.0) * disc_mask(size, device=image.device)
+
+
+def _over(layers: torch.Tensor, below: torch.Tensor) -> torch.Tensor:
+    """Colours (1, 3, S, S) of weighted ones, (1, 4, S, S) with the weight last; where that is small, those below, of any size."""
+    share = layers[:, 3:]
+    trust = (4.0 * share).clamp(max=1.0)
+    below = F.interpolate(below, layers.shape[-1], mode="bilinear")
+    return trust * layers[:, :3] / share.clamp(min=1e-6) + (1.0 - trust) * below
 
 
 def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> Iterator[Round]:
@@ -249,8 +252,18 @@ def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> I
         splits = {id(part): ways for part, ways in zip(parts, found, strict=True)}
         drawn += len(parts)
         grown = [variant for pool in pools for variant in _grown(pool, splits, settings)]
-        pools = tuple(sorted(grown, key=lambda pool: pool.loss(settings.stop))[: settings.trees])
+        best = sorted(grown, key=lambda pool: pool.loss(settings.stop))[: settings.trees]
+        pools = tuple(_limited(pool, settings.nodes) for pool in best)
         yield Round(pools, drawn)
+
+
+def _limited(pool: Pool, most: int) -> Pool:
+    """The pool with open parts left over that are too many."""
+    room = most - sum(part.state == "split" for part in pool.parts)
+    over = set(pool.open[room:])
+    if not over:
+        return pool
+    return Pool(tuple(dataclasses.replace(part, state="left over") if k in over else part for k, part in enumerate(pool.parts)))
 
 
 def _splits(parts: Sequence[Part], networks: Networks, settings: Inference, generator: torch.Generator) -> list[list[_Split]]:
@@ -259,11 +272,12 @@ def _splits(parts: Sequence[Part], networks: Networks, settings: Inference, gene
     given = _stacked([part.codes for part in parts])
     drawn = networks.priors.sample_children(networks.vqvae, given, count, generator, settings.temperature)
     parents = torch.stack([part.image for part in parts]).repeat_interleave(count, 0)
+    shown = networks.vqvae.decode(given).repeat_interleave(count, 0)
     left, right = (networks.vqvae.decode(codes) for codes in drawn)
     operators = networks.heads.operator(parents, left, right).argmax(1)
     masks = torch.sigmoid(networks.heads.mask(parents, left, right))
     kinds = [networks.heads.types(child).argmax(1).tolist() for child in (left, right)]
-    terms = criterion(parents, left, right, operators, masks, settings)
+    terms = criterion(parents, shown, left, right, operators, masks, settings)
     found: list[list[_Split]] = []
     for number, part in enumerate(parts):
         rows = range(number * count, (number + 1) * count)
@@ -289,11 +303,14 @@ def _child(image: Image, codes: Codes, kind: str, depth: int, settings: Inferenc
     return Part(image, codes, kind, state, depth)
 
 
-def criterion(parents: Image, left: Image, right: Image, operators: torch.Tensor, masks: Mask, settings: Inference) -> list[Terms]:
+def criterion(
+    parents: Image, shown: Image, left: Image, right: Image, operators: torch.Tensor, masks: Mask, settings: Inference
+) -> list[Terms]:
     """L_select of B samples and its terms.
 
     Args:
-        parents, left, right: (B, 3, S, S). operators: (B,), index of `OPERATORS`. masks: (B, 1, S, S) in [0, 1].
+        parents, left, right: (B, 3, S, S). shown: the parents as they come out of their codes.
+        operators: (B,), index of `OPERATORS`. masks: (B, 1, S, S) in [0, 1].
     """
     disc = disc_mask(parents.shape[-1], device=parents.device)
     rebuilt = torch.stack([BLENDS[name].apply(left, right, *([masks] if name == "mix" else [])) for name in OPERATORS])
@@ -306,7 +323,7 @@ def criterion(parents: Image, left: Image, right: Image, operators: torch.Tensor
         found = -(least.clamp(LEAST, SEEN) / SEEN).log()
         return found if ignored is None else found.masked_fill(ignored, 0.0)
 
-    similar = near(parents)
+    similar = near(shown)
     blank, white = near(torch.zeros_like(parents), mixed), near(disc.to(parents).expand_as(parents), mixed)
     select = recon + settings.similar * similar + settings.blank * blank + settings.white * white
     columns = (column.tolist() for column in (recon, similar, blank, white, select))
@@ -334,7 +351,7 @@ def _grown(pool: Pool, splits: dict[int, list[_Split]], settings: Inference) -> 
 def _split(pool: Pool, ways: dict[int, _Split], stop: float) -> Pool:
     parts = list(pool.parts)
     for place, way in ways.items():
-        if way.terms.select > stop:
+        if way.terms.select > settings.stop:
             parts[place] = dataclasses.replace(parts[place], state="left over", terms=way.terms)
             continue
         parts[place] = dataclasses.replace(

@@ -219,7 +219,8 @@ class Learned(Growth):
         if self.settings.second_stage == "depth":
             image, valid = (self.image, self.valid) if is_root else (part.image.cpu(), disc_mask(part.image.shape[-1]))
             return self._by_depth(image, valid, room, is_root)
-        samples, effort = self.samples, self.effort
+        # Of the picture itself: grown, but not looked at as a drawing, which would be the search in the place of the networks.
+        samples, effort = self.samples, dataclasses.replace(self.effort, beam=0, rounds=0)
         if not is_root:
             pixels = Pixels.of(part.image.cpu(), None, SIZE)
             samples = Samples(pixels, pixels, pixels, dictionary_of(pixels), dictionary_of(pixels))
@@ -336,15 +337,16 @@ class Unproposed(Search):
         self.stages = Stages("search", why)
 
 
-def least_useful(root: Node, pixels: Pixels) -> Node | None:
-    """The tree without the leaf whose loss hurts least; None where only one is left."""
-    options = [fit_pixels(pixels, smaller, steps=3) for smaller in removals(root)]
+def least_useful(root: Node, pixels: Pixels, steps: int = 3) -> Node | None:
+    """The tree without the leaf whose loss hurts least after so many steps of a fit; None where only one is left."""
+    options = [fit_pixels(pixels, smaller, steps=steps, softest=FINE_SOFTNESS) for smaller in removals(root)]
     return min(options, key=lambda option: option.error).root if options else None
 
 
 def within(root: Node, pixels: Pixels, most: int) -> Node | None:
     """The tree without its least useful leaves until it stores at most so many values; None where that cannot be."""
     found: Node | None = root
-    while found is not None and count_values(found) > most:
-        found = least_useful(found, pixels)
+    while found is not None and (over := count_values(found) - most) > 0:
+        # A tree that is far too large is full of leaves that nothing rests on.
+        found = least_useful(found, pixels, steps=3 if over < 12 else 0)
     return found
