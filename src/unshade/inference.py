@@ -351,7 +351,7 @@ def _grown(pool: Pool, splits: dict[int, list[_Split]], settings: Inference) -> 
 def _split(pool: Pool, ways: dict[int, _Split], stop: float) -> Pool:
     parts = list(pool.parts)
     for place, way in ways.items():
-        if way.terms.select > settings.stop:
+        if way.terms.select > stop:
             parts[place] = dataclasses.replace(parts[place], state="left over", terms=way.terms)
             continue
         parts[place] = dataclasses.replace(
