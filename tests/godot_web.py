@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from chromium import decoded, posted_by
 
+from chromium import decoded, posted_by
 from unshade.nodes import Raster
 from unshade.rasters import raster_to_png
 
@@ -88,9 +88,9 @@ func _ready() -> void:
         shape.material_override = material
         for frame in 3:
             await RenderingServer.frame_post_draw
-        var uniforms := RenderingServer.get_shader_parameter_list(shader.get_rid())
+        var uniforms := RenderingServer.get_shader_parameter_list(shader.get_rid()).map(func(entry): return entry.name)
         var drawn := viewport.get_texture().get_image()
-        found[name] = {"uniforms": uniforms.size(), "picture": Marshalls.raw_to_base64(drawn.save_png_to_buffer())}
+        found[name] = {"uniforms": uniforms, "picture": Marshalls.raw_to_base64(drawn.save_png_to_buffer())}
     JavaScriptBridge.eval("window.finish(%s)" % JSON.stringify(JSON.stringify(found)), true)
 """
 
@@ -98,7 +98,8 @@ PAGE = """<!doctype html><meta charset="utf-8"><canvas id="canvas"></canvas><scr
 window.jobs = JSON.stringify(JOBS);
 const said = [];
 window.finish = (found) => fetch("found", { method: "POST", body: JSON.stringify({ found: JSON.parse(found), said }) });
-new Engine({ args: ["--audio-driver", "Dummy"], executable: "index", mainPack: "project.pck", canvasResizePolicy: 0, emscriptenPoolSize: 8, godotPoolSize: 4, gdextensionLibs: [],
+new Engine({ args: ["--audio-driver", "Dummy"], executable: "index", mainPack: "project.pck", canvasResizePolicy: 0,
+  emscriptenPoolSize: 8, godotPoolSize: 4, gdextensionLibs: [],
   onPrintError: (...words) => said.push(words.join(" ")) }).startGame({ canvas: document.querySelector("canvas") });
 </script>"""
 
@@ -119,8 +120,8 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
 def godot_pictures(
     browser: str, engine: Path, folder: Path, shaders: Mapping[str, str], pictures: Mapping[str, Mapping[str, Raster]], size: int
-) -> dict[str, tuple[int, np.ndarray]]:
-    """For each shader how many parameters Godot found and what it drew, (3, size, size). Raises AssertionError with Godot's words."""
+) -> dict[str, tuple[set[str], np.ndarray]]:
+    """For each shader the parameters that Godot found and what it drew, (3, size, size). Raises AssertionError with Godot's words."""
     for file in (*engine.glob("index*.js"), engine / "index.wasm"):
         shutil.copy(file, folder / file.name)
     script = SCRIPT.replace("{size}", str(size)).replace("    ", "\t")
@@ -134,4 +135,4 @@ def godot_pictures(
     (folder / "godot.html").write_text(PAGE.replace("JOBS", json.dumps(jobs).replace("</", "<\\/")), encoding="utf-8")
     answer = json.loads(posted_by(browser, folder, "godot.html", timeout=240.0))
     assert not answer["said"], answer["said"]
-    return {name: (entry["uniforms"], decoded(base64.b64decode(entry["picture"]))) for name, entry in answer["found"].items()}
+    return {name: (set(entry["uniforms"]), decoded(base64.b64decode(entry["picture"]))) for name, entry in answer["found"].items()}

@@ -5,26 +5,25 @@ from __future__ import annotations
 import re
 from functools import cache
 
-import MaterialX as mx
-from chromium import Job
-from MaterialX import PyMaterialXGenGlsl as glsl_generator
-from MaterialX import PyMaterialXGenShader as generator
+import MaterialX
+from MaterialX import PyMaterialXGenGlsl, PyMaterialXGenShader
 
+from chromium import Job
 from unshade.export.program import Program
 
 
 @cache
-def library() -> mx.Document:
+def library() -> MaterialX.Document:
     """The standard library."""
-    found = mx.createDocument()
-    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), found)
+    found = MaterialX.createDocument()
+    MaterialX.loadLibraries(MaterialX.getDefaultDataLibraryFolders(), MaterialX.getDefaultDataSearchPath(), found)
     return found
 
 
-def document(text: str) -> mx.Document:
+def document(text: str) -> MaterialX.Document:
     """A document that stands on the library. Raises AssertionError with the validator's words."""
-    found = mx.createDocument()
-    mx.readFromXmlString(found, text)
+    found = MaterialX.createDocument()
+    MaterialX.readFromXmlString(found, text)
     found.setDataLibrary(library())
     valid, said = found.validate()
     assert valid, said
@@ -33,14 +32,14 @@ def document(text: str) -> mx.Document:
 
 def job(text: str, made: Program) -> Job:
     """The pixel shader of a document's material for the sphere under an eye far away, its uniforms as constants."""
-    maker = glsl_generator.EsslShaderGenerator.create()
-    context = generator.GenContext(maker)
-    context.registerSourceCodeSearchPath(mx.getDefaultDataSearchPath())
+    maker = PyMaterialXGenGlsl.EsslShaderGenerator.create()
+    context = PyMaterialXGenShader.GenContext(maker)
+    context.registerSourceCodeSearchPath(MaterialX.getDefaultDataSearchPath())
     context.getOptions().hwSrgbEncodeOutput = True
     whole = document(text)  # must outlive its elements
     shader = maker.generate("tree", whole.getChild("unshade"), context)
-    source = shader.getSourceCode(generator.PIXEL_STAGE)
-    block = shader.getStage(generator.PIXEL_STAGE).getUniformBlock("PublicUniforms")
+    source = shader.getSourceCode(PyMaterialXGenShader.PIXEL_STAGE)
+    block = shader.getStage(PyMaterialXGenShader.PIXEL_STAGE).getUniformBlock("PublicUniforms")
     samplers = []
     for k in range(len(block)):
         port = block[k]

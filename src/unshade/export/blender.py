@@ -120,7 +120,10 @@ def command() -> list[str]:
 
     Raises MissingExtraError.
     """
-    named = os.environ.get("UNSHADE_BLENDER") or shutil.which("blender")
+    named = os.environ.get("UNSHADE_BLENDER")
+    if named and not shutil.which(named):
+        raise MissingExtraError(f"UNSHADE_BLENDER: expected a program, got {named}")
+    named = named or shutil.which("blender")
     if named and not Path(named).name.startswith("python"):
         return [named, "--background", "--factory-startup", "--python-exit-code", "1", "--python"]
     if named or importlib.util.find_spec("bpy"):
