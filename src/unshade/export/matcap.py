@@ -6,14 +6,15 @@ the disc every pixel has the normal of the nearest point of the silhouette.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import torch
 
-from unshade.errors import UnshadeError
+from unshade.errors import MissingExtraError, UnshadeError
 from unshade.nodes import Node, Tree
 from unshade.picture_output import write_picture
-from unshade.render import render
+from unshade.render import part, render, srgb_decode
 from unshade.sphere import normals_from_xy, sphere_grid
 from unshade.types import Image
 
@@ -36,3 +37,28 @@ def padded(tree: Tree | Node, size: int, padding: int = 0) -> Image:
 def write_png(tree: Tree, path: Path, size: int = 512, bits: int | str = 8, padding: int = 0) -> None:
     """A PNG of 8 or 16 bits."""
     write_picture(path, padded(tree, size, padding), bits=int(bits))
+
+
+def write_exr(tree: Tree, path: Path, size: int = 512, padding: int = 0) -> None:
+    """An EXR of linear light, half floats, divided by the exposure that the tree was made with. Raises MissingExtraError."""
+    write_picture(path, padded(tree, size, padding), exposure=tree.exposure)
+
+
+def write_blender_matcap(tree: Tree, path: Path, size: int = 512, padding: int = 0) -> None:
+    """An EXR with the layers ``diffuse`` and ``specular``, which Blender's MatCap adds in linear light.
+
+    A tree screens its lights over its form instead. So ``specular`` is what the lights add to the light of the whole picture,
+    ``decode(all) - decode(form)``, and the sum is the tree's picture; it is never negative, since no operator darkens where an
+    input brightens. Raises MissingExtraError.
+    """
+    try:
+        import OpenEXR
+    except ImportError:
+        raise MissingExtraError(f"{path}: EXR files need the OpenEXR library; install it with: pip install 'unshade[exr]'") from None
+    form = padded(dataclasses.replace(tree, root=part(tree.root, "diffuse")), size, padding)
+    diffuse, whole = (srgb_decode(shown.double().clamp(0.0, 1.0)) / tree.exposure for shown in (form, padded(tree, size, padding)))
+    layers = {"diffuse": diffuse, "specular": (whole - diffuse).clamp(min=0.0)}
+    channels = {f"{name}.{letter}": light[k].half().numpy() for name, light in layers.items() for k, letter in enumerate("RGB")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))

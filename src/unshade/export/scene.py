@@ -7,6 +7,7 @@ works on linear light are encoded one by one, which is right for each alone and 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -72,85 +73,76 @@ class Item:
     """Its brightness is the share of this item."""
 
 
-def scene(tree: Tree, tolerance: float | None = None) -> Item:
+def scene(tree: Tree) -> Item:
     """The items of a tree, the root outermost."""
-    return _Scene(tree, tolerance).node(tree.root, tree.root.kind)
+    linear = tree.blend_space == "linear"
 
-
-class _Scene:
-    def __init__(self, tree: Tree, tolerance: float | None) -> None:
-        self.linear = tree.blend_space == "linear"
-        self.options = {} if tolerance is None else {"tolerance": tolerance}
-        self.drawings: dict[Leaf, Art] = {}
-
-    def node(self, node: Node, address: str) -> Item:
+    def item(node: Node, address: str) -> Item:
         label = node.name or node.kind
         if isinstance(node, Leaf):
-            return replace(self.leaf(node), address=address, label=label)
-        items = [self.node(child, f"{address}.{k}.{child.kind}") for k, child in enumerate(node.children)]
+            return replace(_leaf(Leaf(node.kind, node.values), linear), address=address, label=label)
+        items = [item(child, f"{address}.{k}.{child.kind}") for k, child in enumerate(node.children)]
         if node.mask is not None:
-            mask = replace(self.leaf(node.mask), address=f"{address}.mask", label=node.mask.name or node.mask.kind)
-            items = [items[1], replace(items[0], mask=mask)]
+            items = [items[1], replace(items[0], mask=item(node.mask, f"{address}.mask"))]
         else:
             mode: Mode = "multiply" if node.kind == "multiply" else "screen"
-            items[1:] = [replace(item, mode=mode) for item in items[1:]]
+            items[1:] = [replace(above, mode=mode) for above in items[1:]]
         return Item(tuple(items), address, label)
 
-    def leaf(self, leaf: Leaf) -> Item:
-        if leaf.kind == "albedo":
-            return Item(Plain(self.color(leaf["color"])))
-        if leaf.kind == "environment":
-            return self.environment(leaf)
-        if leaf.kind in PROFILED:
-            bare = Leaf(leaf.kind, leaf.values)
-            if bare not in self.drawings:
-                self.drawings[bare] = self.art(bare)
-            return Item(self.drawings[bare])
-        mask = KINDS[leaf.kind].role is Role.MASK
-        layout = Layout.of(leaf)
-        shown = evaluate(leaf, sphere_normals(PICTURE_SIZE), layout.pack(leaf).float(), layout).expand(3, -1, -1)
-        return Item(Picture(srgb_encode(shown) if self.linear and not mask else shown))
+    return item(tree.root, tree.root.kind)
 
-    def color(self, color: tuple[float, ...]) -> Color:
-        if self.linear:
-            color = tuple(srgb_encode(torch.tensor(color, dtype=torch.float64)).tolist())
-        return (color[0], color[1], color[2])
 
-    def encoded(self, found: Profile) -> Profile:
-        shade = found.shade
-        return replace(found, shade=lambda q: srgb_encode(torch.from_numpy(np.asarray(shade(q)))).numpy()) if self.linear else found
-
-    def art(self, leaf: Leaf) -> Art:
-        found = profile(leaf)
-        if KINDS[leaf.kind].role is not Role.MASK:
-            found = self.encoded(found)
-        drawing = drawn(found, **self.options)
+@lru_cache(maxsize=512)
+def _leaf(leaf: Leaf, linear: bool) -> Item:
+    """A leaf or a mask without its name. Kept, since finding a drawing takes a few tenths of a second."""
+    linear = linear and KINDS[leaf.kind].role is not Role.MASK
+    if leaf.kind == "albedo":
+        return Item(Plain(_color(leaf["color"], linear)))
+    if leaf.kind == "environment":
+        return _environment(leaf, linear)
+    if leaf.kind in PROFILED:
+        found = _encoded(profile(leaf), linear)
+        drawing = drawn(found)
         if leaf.kind == "rim":
-            drawing += (Fill(self.grazing(leaf["exponent"][0]), multiply=True),)
-        return Art(found.angle, drawing)
+            drawing += (Fill(_grazing(leaf["exponent"][0], linear), multiply=True),)
+        return Item(Art(found.angle, drawing))
+    layout = Layout.of(leaf)
+    shown = evaluate(leaf, sphere_normals(PICTURE_SIZE), layout.pack(leaf).float(), layout).expand(3, -1, -1)
+    return Item(Picture(srgb_encode(shown) if linear else shown))
 
-    def grazing(self, exponent: float) -> Radial:
-        """A rim's factor ``(1 - z)^exponent``."""
 
-        def factor(radius: Numbers) -> Numbers:
-            grazing = np.clip(1.0 - np.sqrt(np.clip(1.0 - radius * radius, 0.0, 1.0)), 1e-6, 1.0) ** exponent
-            return srgb_encode(torch.from_numpy(grazing)).numpy() if self.linear else grazing
+def _color(color: tuple[float, ...], linear: bool) -> Color:
+    if linear:
+        color = tuple(srgb_encode(torch.tensor(color, dtype=torch.float64)).tolist())
+    return (color[0], color[1], color[2])
 
-        return Radial(0.0, 1.0, 1.0, 0.0, tuple(simplified(factor, 0.0, 1.0, 0.003)))
 
-    def environment(self, leaf: Leaf) -> Item:
-        """The sum of the lobes. Screened where that is nearly their sum, else their mean (each over the last at 1/k opacity) times
-        their number, which a dodge with a constant is: ``below / (1 - constant)``, clamped at 1."""
-        found = lobes(leaf)
-        arts = [Art(lobe.angle, drawn(self.encoded(lobe), **self.options), self.color(color)) for lobe, color in found]
-        if len(arts) == 1:
-            return Item(arts[0])
-        count = len(arts)
-        if _overlap(leaf) <= SAME_SUM:
-            return Item(tuple(Item(art, label=f"lobe {k + 1}", mode="screen" if k else "normal") for k, art in enumerate(arts)))
-        items = [Item(art, label=f"lobe {k + 1}", opacity=1.0 / (k + 1)) for k, art in enumerate(arts)]
-        share = 1.0 - 1.0 / count
-        return Item((*items, Item(Plain((share, share, share)), label=f"times {count}", mode="color-dodge")))
+def _encoded(found: Profile, linear: bool) -> Profile:
+    shade = found.shade
+    return replace(found, shade=lambda q: srgb_encode(torch.from_numpy(np.asarray(shade(q)))).numpy()) if linear else found
+
+
+def _grazing(exponent: float, linear: bool) -> Radial:
+    """A rim's factor ``(1 - z)^exponent``."""
+
+    def factor(radius: Numbers) -> Numbers:
+        grazing = np.clip(1.0 - np.sqrt(np.clip(1.0 - radius * radius, 0.0, 1.0)), 1e-6, 1.0) ** exponent
+        return srgb_encode(torch.from_numpy(grazing)).numpy() if linear else grazing
+
+    return Radial(0.0, 1.0, 1.0, 0.0, tuple(simplified(factor, 0.0, 1.0, 0.003)))
+
+
+def _environment(leaf: Leaf, linear: bool) -> Item:
+    """The sum of the lobes. Screened where that is nearly their sum, else their mean (each over the last at 1/k opacity) times
+    their number, which a dodge with a constant is: ``below / (1 - constant)``, clamped at 1."""
+    arts = [Art(lobe.angle, drawn(_encoded(lobe, linear)), _color(color, linear)) for lobe, color in lobes(leaf)]
+    if len(arts) == 1:
+        return Item(arts[0])
+    if _overlap(leaf) <= SAME_SUM:
+        return Item(tuple(Item(art, label=f"lobe {k + 1}", mode="screen" if k else "normal") for k, art in enumerate(arts)))
+    items = [Item(art, label=f"lobe {k + 1}", opacity=1.0 / (k + 1)) for k, art in enumerate(arts)]
+    share = 1.0 - 1.0 / len(arts)
+    return Item((*items, Item(Plain((share, share, share)), label=f"times {len(arts)}", mode="color-dodge")))
 
 
 PROFILED = {"diffuse", "highlight", "rim", "toon_diffuse", "toon_highlight", "threshold", "stripe"}

@@ -66,6 +66,16 @@ def svg(tree: Tree, size: int = 512, shape: Shape | None = None) -> str:
     )
 
 
+def svg_of(item: Item) -> str:
+    """The bare document of one item on the square around the disc, for use in another format."""
+    writer = _Writer()
+    body = writer.item(Item(item.content))
+    return (
+        '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" viewBox="-1 -1 2 2">'
+        f'<defs>{writer.definitions()}</defs><g transform="scale(1 -1)">{body}</g></svg>'
+    )
+
+
 def number(value: float, digits: int = 4) -> str:
     """The shortest text of a number: ``.5``, ``-2``."""
     text = f"{value:.{digits}f}".rstrip("0").rstrip(".") if digits else f"{value:.0f}"

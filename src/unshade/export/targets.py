@@ -95,6 +95,14 @@ ENCODED = Loss(
     "each leaf is encoded for itself and blended so: a multiply looks nearly the same, a screen or a soft mix lighter or darker",
     linear,
 )
+PIXELS = Loss("a leaf's parameters", "it becomes pixels; the tree is kept beside them and can be read back", lambda tree: [])
+FLAT = Loss("a leaf's parameters", "it becomes pixels", lambda tree: [])
+MERGED = Loss(
+    "a mask over several nodes",
+    "they become one layer with the mask as its transparency",
+    lambda tree: [address for address, node in tree.walk() if node.kind == "mix" and not hasattr(node.children[0], "values")],
+)
+ADDED = Loss("nodes and a screen", "the tree becomes two layers whose sum in linear light is its picture", lambda tree: [])
 BOUND = Loss("the picture of a leaf", "it becomes a texture to bind by hand, as PNG data in a comment at the end", RASTERS)
 BESIDE = Loss("the picture of a leaf in a .mtlx", "it must stand beside it as a PNG; a .zip brings it along", lambda tree: [])
 """Said by the writer, which knows the suffix."""
@@ -130,6 +138,54 @@ TARGETS = {
             "PDFium and Poppler",
             ("size", "shape", "region"),
             needs="pikepdf; svgelements (for a shape)",
+        ),
+        Target(
+            "css",
+            (".html",),
+            "a div in gradients, masks and blend modes",
+            "css.write_css",
+            (EMBEDDED, ENCODED),
+            "Chromium",
+            ("size",),
+        ),
+        Target(
+            "psd",
+            (".psd",),
+            "layers and groups with blend modes and masks, named as the nodes; can be read back",
+            "psd.write_psd",
+            (PIXELS, ENCODED),
+            "psd-tools and PhotoshopAPI",
+            ("size", "bits"),
+            needs="psd-tools",
+        ),
+        Target(
+            "ora",
+            (".ora",),
+            "OpenRaster layers and blend modes, named as the nodes",
+            "ora.write_ora",
+            (FLAT, MERGED, ENCODED),
+            "Krita 5.1 and pyora",
+            ("size", "bits"),
+        ),
+        Target(
+            "exr",
+            (".exr",),
+            "a MatCap in linear light, continued past the silhouette",
+            "matcap.write_exr",
+            (PICTURE,),
+            "OpenEXR",
+            ("size", "padding"),
+            needs="OpenEXR",
+        ),
+        Target(
+            "blender-matcap",
+            (".exr",),
+            "Blender's MatCap: layers diffuse and specular",
+            "matcap.write_blender_matcap",
+            (ADDED,),
+            "Blender 5.0",
+            ("size", "padding"),
+            needs="OpenEXR",
         ),
         Target("glsl", (".glsl",), "a function of the normal, parameters as uniforms", "glsl.write", (BOUND,), "Chromium and glslang"),
         Target("wgsl", (".wgsl",), "a function of the normal and a structure of parameters", "wgsl.write", (BOUND,), "naga (wgpu)"),
