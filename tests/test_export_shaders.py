@@ -135,7 +135,7 @@ def test_names_are_unique_and_safe() -> None:
     made = program(hostile_tree())
     names = [item.name for item in made.uniforms] + [line.name for line in made.statements]
     assert len(set(names)) == len(names) == 4 * len(HOSTILE) + 1
-    assert all(re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) and not name.startswith("gl_") for name in SOME)
+    assert all(re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) and not name.startswith("gl_") for name in names)
     for text in (glsl(made), wgsl(made), godot(made), unity(made)):
         assert "*/" not in text and "</script>" not in text and "-->" not in text
     assert "</script> -->" not in page(made) and page(made).count("</script>") == 2
@@ -410,6 +410,21 @@ def test_godot(browser: str, tmp_path: Path) -> None:
     for name, (known, picture) in godot_pictures(browser, Path(engine), tmp_path, texts, rasters, SIZE).items():
         assert {item.name for item in (*PROGRAMS[name].uniforms, *PROGRAMS[name].pictures)} <= known
         assert psnr(picture, godot_shows(expected(TREES[name]))) >= NEAR, name
+
+
+def test_normals_are_seen_along_the_ray() -> None:
+    """In perspective the silhouette keeps the normals of the silhouette; without it nothing changes."""
+    space = {"vec3": vector, "dot": lambda a, b: np.asarray((a * b).sum(0)), "cross": lambda a, b: np.cross(a, b, axis=0).view(Vector)}
+    space["normalize"] = lambda a: a / np.sqrt((a * a).sum(0))
+    exec(functions()["seen"].source, space)
+    normals = sphere_normals(32, dtype=torch.float64).numpy().view(Vector)
+    to_eye = np.zeros_like(normals) + np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1)
+    np.testing.assert_allclose(space["seen"](normals, to_eye), normals, atol=1e-12)
+    eye = np.array([0.3, -0.2, 3.0]).reshape(3, 1, 1)
+    to_eye = (eye - normals) / np.sqrt(((eye - normals) ** 2).sum(0))
+    found = space["seen"](normals, to_eye.view(Vector))
+    np.testing.assert_allclose((found**2).sum(0), 1.0, atol=1e-12)
+    np.testing.assert_allclose(found[2], (normals * to_eye).sum(0), atol=1e-12)
 
 
 def test_colors_round_trip_between_spaces() -> None:

@@ -19,10 +19,8 @@ from pathlib import Path
 from unshade.errors import MissingExtraError, OutputError
 from unshade.export.blender_script import RUNTIME, SCENE
 from unshade.export.program import Program, Uniform, program
-from unshade.export.shader_text import by_leaf
 from unshade.nodes import Tree
 from unshade.rasters import raster_to_png
-from unshade.render import srgb_decode
 
 HEAD = '''\
 """Made by unshade: a shade tree as a node group, for Blender 4.2 and later.
@@ -46,19 +44,10 @@ def _socket(uniform: Uniform, made: Program) -> str:
     socket, subtype = SOCKETS[kind]
     value: object = uniform.value[0] if kind == "float" else uniform.value
     if kind == "color":
-        value = (*linear(uniform.value, made), 1.0)
+        value = (*made.picked(uniform, "linear"), 1.0)
     span = (uniform.parameter.low, uniform.parameter.high)
     label = uniform.name.replace("_", " ")
     return f"    ({uniform.name!r}, {label!r}, {socket!r}, {subtype!r}, {value!r}, {span!r}, {uniform.parameter.meaning!r}),"
-
-
-def linear(value: tuple[float, ...], made: Program) -> tuple[float, ...]:
-    """A colour of the tree as linear light."""
-    if made.space == "linear":
-        return value
-    import torch
-
-    return tuple(round(number, 9) for number in srgb_decode(torch.tensor(value, dtype=torch.float64)).tolist())
 
 
 INTERFACE = '''
@@ -99,7 +88,7 @@ def script(made: Program) -> str:
     functions = made.functions("linear", "seen", *(["encode_color"] if made.space == "srgb" else []))
     lines += [f"\n@group\n{function.source}\n" for function in functions]
     lines.append("\n# (name, label, socket, subtype, value, range, meaning) of each parameter, by leaf.\nLEAVES = [")
-    for _, uniforms in by_leaf(made.uniforms):
+    for _, uniforms in made.by_leaf():
         lines += [f"    ({uniforms[0].leaf!r}, [", *(f"    {_socket(uniform, made)}" for uniform in uniforms), "    ]),"]
     lines += ["]", ""]
     for item in made.pictures:

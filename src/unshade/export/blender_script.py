@@ -179,7 +179,8 @@ def view():
         geometry = building.nodes.new("ShaderNodeNewGeometry")
         turned = []
         for name, kind in (("Normal", "NORMAL"), ("Incoming", "VECTOR")):
-            turn = add("ShaderNodeVectorTransform", Value(geometry.outputs[name], "vec3"), vector_type=kind, convert_from="WORLD", convert_to="CAMERA")
+            spaces = {"vector_type": kind, "convert_from": "WORLD", "convert_to": "CAMERA"}
+            turn = add("ShaderNodeVectorTransform", Value(geometry.outputs[name], "vec3"), **spaces)
             turned.append(normalize(Value(turn, "vec3") * (1.0, 1.0, -1.0)))
         return seen(*turned)
     return nodes_of("unshade view", [], "vec3", build)

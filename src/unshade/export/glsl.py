@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from unshade.export.program import Program, program
-from unshade.export.shader_text import Language, by_leaf, picture_comments, printed
+from unshade.export.shader_text import Language, picture_comments, printed
 from unshade.nodes import Tree
 
 GLSL = Language(words={"atan2": "atan"})
@@ -28,7 +28,7 @@ HEAD = """\
 def glsl(program: Program) -> str:
     """The text of a GLSL include file."""
     lines = [HEAD]
-    for address, uniforms in by_leaf(program.uniforms):
+    for address, uniforms in program.by_leaf():
         lines.append(f"// {address}")
         lines += [f"PARAMETER({item.type}, {item.name}, {GLSL.constant(item)})  // {item.summary}" for item in uniforms]
     for picture in program.pictures:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from unshade.export.glsl import GLSL
 from unshade.export.program import Program, Uniform, program
-from unshade.export.shader_text import by_leaf, encoded, number, parts, picture_comments
+from unshade.export.shader_text import number, parts, picture_comments
 from unshade.nodes import Tree
 
 HEAD = """\
@@ -43,7 +43,7 @@ SPACES = {
 
 def _declared(uniform: Uniform, made: Program) -> str:
     if uniform.is_color:
-        return f"uniform vec3 {uniform.name} : source_color = {GLSL.constant_vector(encoded(uniform, made.space))};"
+        return f"uniform vec3 {uniform.name} : source_color = {GLSL.constant_vector(made.picked(uniform, 'srgb'))};"
     low, high = uniform.parameter.low, uniform.parameter.high
     ranged = f" : hint_range({number(low)}, {number(high)}, 0.001)" if uniform.type == "float" else ""
     return f"uniform {uniform.type} {uniform.name}{ranged} = {GLSL.constant(uniform)};"
@@ -54,7 +54,7 @@ def godot(made: Program) -> str:
     language = replace(GLSL, color="picked({name}, is_srgb)")
     reads, gives = SPACES[made.space]
     lines = [HEAD]
-    for address, uniforms in by_leaf(made.uniforms):
+    for address, uniforms in made.by_leaf():
         lines += [f"group_uniforms {uniforms[0].name.removesuffix('_' + uniforms[0].parameter.name)};  // {address}"]
         lines += [f"{_declared(uniform, made)}  // {uniform.parameter.meaning}" for uniform in uniforms]
     lines += ["group_uniforms;"] * bool(made.uniforms)

@@ -12,10 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
-from unshade.export.blender import linear
 from unshade.export.formulas import Function, functions
 from unshade.export.program import Program, Uniform, program
-from unshade.export.shader_text import by_leaf, number
+from unshade.export.shader_text import number
 from unshade.nodes import Tree
 from unshade.rasters import raster_to_png
 
@@ -163,7 +162,7 @@ def _define(root: ElementTree.Element, function: Function) -> None:
 
 def _interface(element: ElementTree.Element, uniform: Uniform, made: Program) -> Value:
     """An input of the tree's graph with its range."""
-    value = linear(uniform.value, made) if uniform.is_color else uniform.value
+    value = made.picked(uniform, "linear") if uniform.is_color else uniform.value
     kind = "color3" if uniform.is_color else TYPES[uniform.type]
     entry = ElementTree.SubElement(element, "input", name=uniform.name, type=kind, value=", ".join(number(part) for part in value))
     low, high = ([number(end)] * len(uniform.value) for end in (uniform.parameter.low, uniform.parameter.high))
@@ -178,7 +177,7 @@ def materialx(made: Program) -> str:
     for function in made.functions("linear", "seen", *(["encode_color"] if made.space == "srgb" else [])):
         _define(root, function)
     element = ElementTree.SubElement(root, "nodegraph", name="unshade_tree")
-    given = {uniform.name: _interface(element, uniform, made) for _, group in by_leaf(made.uniforms) for uniform in group}
+    given = {uniform.name: _interface(element, uniform, made) for _, group in made.by_leaf() for uniform in group}
     graph = Graph(element)
     known: dict[str, Value] = {}
     for uniform in made.uniforms:

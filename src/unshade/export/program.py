@@ -8,12 +8,17 @@ light, `Program.function` puts the conversion at the end.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Literal, TypeAlias
+
+import torch
 
 from unshade.errors import TreeError
 from unshade.export.formulas import Function, called, expression, functions, needed
 from unshade.nodes import KINDS, Leaf, Node, Parameter, Raster, Tree
+from unshade.render import srgb_decode, srgb_encode
 
 Space: TypeAlias = Literal["srgb", "linear"]
 
@@ -78,6 +83,18 @@ class Program:
     statements: tuple[Statement, ...]
     value: str
     """The tree's colour in its blend space."""
+
+    def by_leaf(self) -> Iterator[tuple[str, list[Uniform]]]:
+        """The uniforms of each leaf with its address."""
+        for address, found in groupby(self.uniforms, key=lambda uniform: uniform.address):
+            yield address, list(found)
+
+    def picked(self, uniform: Uniform, space: Space) -> tuple[float, ...]:
+        """A colour's value as a colour picker that works in another space gives it."""
+        if space == self.space:
+            return uniform.value
+        convert = srgb_encode if space == "srgb" else srgb_decode
+        return tuple(round(number, 9) for number in convert(torch.tensor(uniform.value, dtype=torch.float64)).tolist())
 
     def result(self, space: Space) -> str:
         """The tree's colour, converted where the target's space is another one."""

@@ -6,14 +6,10 @@ import ast
 import base64
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import groupby
-
-import torch
 
 from unshade.export.formulas import Function
 from unshade.export.program import Picture, Program, Space, Uniform
 from unshade.rasters import raster_to_png
-from unshade.render import srgb_encode
 
 _PRECEDENCE = {ast.Add: 1, ast.Sub: 1, ast.Mult: 2, ast.Div: 2}
 _SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
@@ -125,19 +121,6 @@ def printed(program: Program, language: Language, space: Space, *others: str, ex
 def _read(uniform: Uniform, language: Language) -> str:
     special = language.color if uniform.is_color else language.vector if uniform.type == "vec3" else ""
     return (special or language.uniform).format(name=uniform.name)
-
-
-def encoded(uniform: Uniform, space: Space) -> tuple[float, ...]:
-    """A colour's value as an sRGB colour picker shows it."""
-    if space == "srgb":
-        return uniform.value
-    return tuple(srgb_encode(torch.tensor(uniform.value, dtype=torch.float64)).tolist())
-
-
-def by_leaf(uniforms: Iterable[Uniform]) -> Iterator[tuple[str, list[Uniform]]]:
-    """The uniforms of each leaf with its address."""
-    for address, found in groupby(uniforms, key=lambda uniform: uniform.address):
-        yield address, list(found)
 
 
 def picture_comments(pictures: Iterable[Picture], language: Language) -> Iterator[str]:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from unshade.export.glsl import GLSL, too_many
 from unshade.export.program import Program, Uniform, program
-from unshade.export.shader_text import encoded, printed
+from unshade.export.shader_text import printed
 from unshade.nodes import Tree
 from unshade.rasters import raster_to_png
 
@@ -86,7 +86,7 @@ export function createMaterial() {
 
 
 def _described(uniform: Uniform, made: Program) -> dict[str, object]:
-    value = encoded(uniform, made.space) if uniform.is_color else uniform.value
+    value = made.picked(uniform, "srgb") if uniform.is_color else uniform.value
     return {
         "type": uniform.parameter.type if uniform.is_color else uniform.type,
         "value": value[0] if uniform.type == "float" else list(value),

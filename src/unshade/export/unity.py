@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from unshade.export.program import Program, Uniform, program
-from unshade.export.shader_text import Language, by_leaf, encoded, number, picture_comments, printed
+from unshade.export.shader_text import Language, number, picture_comments, printed
 from unshade.nodes import Tree
 
 HLSL = Language(
@@ -89,7 +89,7 @@ float4 fragment(Varyings found) : SV_Target
 def _property(uniform: Uniform, made: Program) -> str:
     label = f'_{uniform.name} ("{uniform.leaf} {uniform.label}"'
     if uniform.is_color:
-        return f"{label}, Color) = ({', '.join(number(value) for value in encoded(uniform, made.space))}, 1.0)"
+        return f"{label}, Color) = ({', '.join(number(value) for value in made.picked(uniform, 'srgb'))}, 1.0)"
     if uniform.type == "vec3":
         return f"{label}, Vector) = ({', '.join(number(value) for value in uniform.value)}, 0.0)"
     slider = "[PowerSlider(4.0)] " if uniform.parameter.logarithmic else ""
@@ -99,7 +99,7 @@ def _property(uniform: Uniform, made: Program) -> str:
 def properties(made: Program) -> list[str]:
     """The lines of the inspector."""
     lines = []
-    for _, uniforms in by_leaf(made.uniforms):
+    for _, uniforms in made.by_leaf():
         lines.append(f"[Header({re.sub(r'[^A-Za-z0-9 ]+', ' ', uniforms[0].leaf).strip() or 'leaf'})]")
         lines += [_property(uniform, made) for uniform in uniforms]
     return lines + [f'[NoScaleOffset] _{picture.name} ("{picture.name.replace("_", " ")}", 2D) = "white" {{}}' for picture in made.pictures]
@@ -108,7 +108,7 @@ def properties(made: Program) -> list[str]:
 def hlsl(made: Program) -> str:
     """The HLSL inside: parameters, functions, and the two stages."""
     lines = ["CBUFFER_START(UnityPerMaterial)"]
-    for address, uniforms in by_leaf(made.uniforms):
+    for address, uniforms in made.by_leaf():
         lines.append(f"    // {address}")
         for uniform in uniforms:
             kind = "float" if uniform.type == "float" else "float4"

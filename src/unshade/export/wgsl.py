@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from unshade.export.program import Program, program
-from unshade.export.shader_text import Language, by_leaf, picture_comments, printed
+from unshade.export.shader_text import Language, picture_comments, printed
 from unshade.nodes import Tree
 
 WGSL = Language(
@@ -43,7 +43,7 @@ def wgsl(program: Program) -> str:
     """The text of a WGSL module."""
     places = iter(offsets(program))
     lines = [HEAD, "struct Parameters {"]
-    for address, uniforms in by_leaf(program.uniforms):
+    for address, uniforms in program.by_leaf():
         lines.append(f"    // {address}")
         lines += [f"    {item.name}: {WGSL.types[item.type]},  // byte {next(places)}; {item.summary}" for item in uniforms]
     lines += ["    unshade_end: f32,"] * (not program.uniforms) + ["}", ""]
