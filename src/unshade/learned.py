@@ -177,7 +177,7 @@ class Learned(Growth):
             second: dict[int, Node] = {}
             for place in pool.left_over if self.settings.second_stage != "none" else []:
                 with self.stages.clock("second stage"):
-                    second[place] = self._second_stage(pool.parts[place], place == 0)
+                    second[place] = self._second_stage(pool.parts[place], place == 0, self._room(pool))
                 best = min(best, self._rough(self.proposing.tree(pool, second)), key=lambda candidate: candidate.error)
                 yield "second stage", best
             root = self.proposing.tree(pool, second)
@@ -213,9 +213,13 @@ class Learned(Growth):
             root = least_useful(current.root, self.samples.points)
             current = self.fit(root, self.samples.points, self.effort.growth_steps) if root is not None else None
 
-    def _second_stage(self, part: Part, is_root: bool) -> Node:
+    def _room(self, pool: Pool) -> int:
+        """Values for each node that was left over, so that the tree stays within its size; 3 at least, one colour."""
+        share = (self.effort.max_values - count_values(self.proposing.tree(pool))) // max(len(pool.left_over), 1)
+        return max(3 + share, 3)
+
+    def _second_stage(self, part: Part, is_root: bool, room: int) -> Node:
         """Decompose a node that was left over: the picture itself where it is the root, else what was decoded."""
-        room = self.effort.max_values if is_root else min(NODE_EFFORT.max_values, self.effort.max_values)
         if self.settings.second_stage == "depth":
             image, valid = (self.image, self.valid) if is_root else (part.image.cpu(), disc_mask(part.image.shape[-1]))
             return self._by_depth(image, valid, room, is_root)
@@ -224,7 +228,7 @@ class Learned(Growth):
         if not is_root:
             pixels = Pixels.of(part.image.cpu(), None, SIZE)
             samples = Samples(pixels, pixels, pixels, dictionary_of(pixels), dictionary_of(pixels))
-            effort = dataclasses.replace(NODE_EFFORT, max_values=room)
+            effort = dataclasses.replace(NODE_EFFORT, max_values=min(room, NODE_EFFORT.max_values))
         steps = [found for _, found in Search(samples, effort).run()]
         self.stages.second_stage_fits += len(steps)
         return steps[-1].root
