@@ -1,8 +1,8 @@
 """The methods of the experiments by name.
 
 - ``cnn``, ``lstm``, ``transformer``: the baselines; with ``+fit`` our fit of the whole tree goes over what they found.
-- ``learned``: the paper's method; ``learned:base``, ``learned:samples``, ``learned:second`` and ``learned:full`` are its ablation, and
-  ``learned:depth`` has the paper's own second stage, minutes a picture.
+- ``learned``: the paper's method; ``learned:base``, ``learned:samples``, ``learned:second`` and ``learned:full`` are its ablation;
+  ``learned:alone`` has no second stage, ``learned:depth`` the paper's own, minutes a picture.
 - ``search:PRESET``, ``hybrid:PRESET``: ours.
 """
 
@@ -32,9 +32,11 @@ VARIANTS: dict[str, Settings] = {
     "samples": Settings(second_stage="none", overall=False),
     "second": Settings(overall=False),
     "full": Settings(),
+    "alone": Settings(second_stage="none"),
     "depth": Settings(second_stage="depth"),
 }
-"""Of ``learned``: one sample; several; the second stage; all, which is the method; all with the paper's second stage."""
+"""Of ``learned``: one sample; several; the second stage; all, which is the method; all but the second stage, so that no search helps the
+networks; all with the paper's second stage."""
 
 FIT = "+fit"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 PARTS = ("decomposition", "analogy", "ablation", "robustness", "anytime", "wild")
 
-METHODS = ("cnn", "lstm", "transformer", "learned", "search:draft", "search:balanced", "search:best", "hybrid:balanced")
+METHODS = ("cnn", "lstm", "transformer", "learned:alone", "learned", "search:draft", "search:balanced", "search:best", "hybrid:balanced")
 
 ABLATION = ("learned:base", "learned:samples", "learned:second", "learned:full")
 """What the paper leaves out, and puts back one after the other."""

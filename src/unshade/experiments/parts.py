@@ -25,7 +25,7 @@ from unshade.render import render
 from unshade.sphere import sphere_normals
 
 SETS = (*STYLES, "pbr", "wild")
-SHOWN_SETS = ("layered", "examples", "drawings")
+SHOWN_SETS = ("layered", "pbr", "drawings")
 
 ANALOGIES = 300
 """Of each component."""
@@ -174,7 +174,7 @@ def _judged(rows: Sequence[Row]) -> Row:
 
 def robustness(context: Context) -> tuple[Document, list[Row]]:
     """Experiment 4: quality over size, and what is left of it when pictures suffer. Scored against the clean picture."""
-    used = [method for method in context.methods if method not in ("search:draft", "search:best")] or list(context.methods)
+    used = [method for method in context.methods if method not in ("search:draft", "search:best", "learned:alone")] or list(context.methods)
     jobs = [
         context.job("tree", case, method, damage=what)
         for dataset in (*STYLES, "pbr")
@@ -229,9 +229,10 @@ def anytime(context: Context) -> tuple[Document, list[Row]]:
 
 
 def wild(context: Context) -> tuple[Document, list[Row]]:
-    """Experiment 4: artists' MatCaps, photographs and drawings, shown."""
+    """Experiment 4: artists' MatCaps, real spheres and drawings, shown."""
     used = [method for method in context.methods if methods.name_of(method).kind in ("learned", "hybrid")]
     used += [method for method in ("search:balanced", "search:best") if method in context.methods]
+    used = used or list(context.methods)
     jobs = [
         context.job("tree", case, method, perceptual=context.perceptual)
         for dataset in (*SHOWN_SETS, "wild")

@@ -21,6 +21,9 @@ from unshade.experiments.parts import PARTS, Context, Document
 from unshade.files import write_whole
 from unshade.models import perceptual
 
+FORMAT = 1
+"""Of the documents; one of another is not put on the page."""
+
 
 @dataclass
 class Ran:
@@ -72,7 +75,14 @@ def run(options: Options, console: Console | None = None) -> Ran:
         failed = work.failed[before:]
         for what in [*(f"skipped {name}: {why}" for name, why in context.skipped.items()), *(f"failed: {what}" for what in failed)]:
             tell(what)
-        head: Document = {"part": part, "seed": options.seed, "limit": options.limit, "machine": machine(), "versions": versions()}
+        head: Document = {
+            "format": FORMAT,
+            "part": part,
+            "seed": options.seed,
+            "limit": options.limit,
+            "machine": machine(),
+            "versions": versions(),
+        }
         head |= {"weights": methods.cards(iter(able), options.weights), "skipped": ran.skipped | context.skipped, "failed": failed}
         ran.documents[part] = head | document
         ran.failed += failed
@@ -127,7 +137,8 @@ def write_page(options: Options) -> None:
     """The page of all documents that there are, whenever they were made. Raises OutputError."""
     paths = [options.results / f"{part}.json" for part in PARTS]
     documents = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths if path.is_file()}
-    _write(options.page, page(options, documents))
+    current = {part: document for part, document in documents.items() if document.get("format") == FORMAT}
+    _write(options.page, page(options, current))
 
 
 def _write(path: Path, text: str) -> None:

@@ -106,9 +106,14 @@ def ablation(options: Options, rows: Sequence[Row]) -> Path | None:
 def wild(options: Options, rows: Sequence[Row]) -> Path | None:
     """All that may be shown; the others apart."""
     kept = [row["dataset"] for row in rows if row["dataset"] in subjects.PRIVATE]
-    draw(options.sheets / "experiments-wild.png", compared(options, rows, kept, 100))
+    draw(options.sheets / "experiments-wild.png", _side_by_side(compared(options, rows, kept, 100)))
     shown = [row["dataset"] for row in rows if row["dataset"] not in subjects.PRIVATE]
-    return draw(options.figures / "wild.png", compared(options, rows, shown, 100))
+    return draw(options.figures / "wild.png", _side_by_side(compared(options, rows, shown, 100)))
+
+
+def _side_by_side(lines: list[list[Cell]]) -> list[list[Cell]]:
+    """Two pictures in a line, so that the sheet is not endless."""
+    return [[cell for line in lines[k : k + 2] for cell in line] for k in range(0, len(lines), 2)]
 
 
 def analogy(options: Options, rows: Sequence[Row]) -> Path | None:

@@ -44,7 +44,8 @@ def figures(rows: Sequence[Row]) -> dict[str, Any]:
         names = dict.fromkeys(name for stages in staged for name in stages["seconds"])
         found["stages"] = {
             "second_stage_share": rounded(sum(s["second_stage_nodes"] for s in staged) / max(1, sum(s["nodes"] for s in staged))),
-            "pictures_with_second_stage": rounded(sum(s["second_stage_nodes"] > 0 for s in staged) / len(staged)),
+            # Nothing was decomposed by the networks: what was found is the second stage's alone.
+            "root_left_over": rounded(sum(s["nodes"] == s["second_stage_nodes"] for s in staged) / len(staged)),
             "seconds": {name: rounded(quantile([s["seconds"].get(name, 0.0) for s in staged], 0.5)) for name in names},
         }
     return found
