@@ -322,17 +322,16 @@ def _learned(
     from unshade import learned
     from unshade.inference import Networks
 
+    proposed = learned.PROPOSED if method == "hybrid" else learned.Settings(second_stage=second_stage, objective=objective)
+    given = settings or proposed
     try:
-        networks = Networks.load(weights)
+        networks = Networks.load(weights, given.device)
     except MissingWeightsError as error:
         if method == "learned":
             raise
         return partial(learned.Unproposed, why=str(error))
-    if method == "learned":
-        given = settings or learned.Settings(second_stage=second_stage, objective=objective)
-        return lambda samples, effort: learned.Learned(sphere.image, sphere.valid, samples, effort, networks, given, seed)
-    given = settings or learned.PROPOSED
-    return lambda samples, effort: learned.Hybrid(sphere.image, sphere.valid, samples, effort, networks, given, seed)
+    main = learned.Learned if method == "learned" else learned.Hybrid
+    return lambda samples, effort: main(sphere.image, sphere.valid, samples, effort, networks, given, seed)
 
 
 def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int, begin: Begin = Search) -> Iterator[Step | Result]:

@@ -71,6 +71,8 @@ class Settings:
     """Optimise the whole tree at the end."""
     objective: Literal["l2", "paper"] = "l2"
     """Of the search by depth."""
+    device: str = "cpu"
+    """Where the networks are; fits are on the CPU. Another device draws other samples from the same seed."""
 
 
 PROPOSED = Settings(Inference(samples=12, trees=4))
