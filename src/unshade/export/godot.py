@@ -1,4 +1,7 @@
-"""Godot 4: a spatial shader, every parameter in the inspector with its range, colours with a picker."""
+"""Godot: a spatial shader, every parameter in the inspector with its range, colours with a picker.
+
+For 4.4 and later: before, Godot did not convert the colours that a shader begins with.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ HEAD = """\
 shader_type spatial;
 render_mode unshaded;
 
-// Made by unshade. Forward+ and Mobile give picked colours as linear light and want linear light back; Compatibility works on
+// Made by unshade, for Godot 4.4 and later. Forward+ and Mobile give picked colours as linear light and want linear light back; Compatibility works on
 // sRGB at both ends. The tree converts where its own numbers are of the other kind.
 """
 
