@@ -6,6 +6,7 @@ The photo holds what no tree does: texture, dirt, shadows. It is carried over in
 - ``ratio``: a texture t lies on the paint and form of the tree, under its lights: ``photo = screen(t * base, lights)``. That is
   affine in t, so a ridge regression per pixel gives ``t = 1 + (photo - tree) g / (g^2 + ridge)`` with ``g = base (1 - lights)``:
   the plain ratio where the base can be seen, 1 where a highlight or darkness hides it. What t does not explain is added.
+  A glint that the tree has not would come out as a texture of white on red, and turn with the paint; see `glints`.
 
 Both give the photo back exactly where the trees are one.
 """
@@ -27,6 +28,10 @@ from unshade.vector_art import Shape
 
 RIDGE = 2e-3
 MOST_TEXTURE = 6.0
+BRIGHT = 1.5
+GREY = 3e-3
+"""Spread of a base's channels below which it is grey."""
+
 PARTS_AGREE = 1e-3
 """A tree is lights over a base where their screen differs from it by less than this."""
 
@@ -46,6 +51,23 @@ def split(tree: Tree, normals: Normals, whole: Image) -> tuple[Image, Image] | N
     base, lights = (shade(Tree(part(tree.root, which), tree.blend_space, tree.exposure), normals) for which in ("diffuse", "specular"))
     agree = tree.blend_space == "srgb" and float((1.0 - (1.0 - base) * (1.0 - lights) - whole).abs().max()) < PARTS_AGREE
     return (base, lights) if agree else None
+
+
+def glints(photo: Image, base: Image, lights: Image) -> Image:
+    """White light in a photo that the tree has not, (1, H, W) in [0, 1).
+
+    Under the tree's lights a pixel is ``u = light + s * base`` in its three channels (the dichromatic model, Shafer 1985), a line
+    whose slope and offset least squares find. It is believed only where the pixel is brighter than the base in every channel: a
+    texture may be of any colour. A grey base shows no such line; up to `BRIGHT` times it is texture.
+    """
+    under = (1.0 - (1.0 - photo) / (1.0 - lights).clamp(min=0.05)).clamp(0.0, 1.0)
+    middle, level = base.mean(-3, keepdim=True), under.mean(-3, keepdim=True)
+    spread = (base - middle).square().sum(-3, keepdim=True)
+    usual = (level / middle.clamp(min=0.02)).clamp(max=BRIGHT)
+    slope = (((under - level) * (base - middle)).sum(-3, keepdim=True) + GREY * usual) / (spread + GREY)
+    light = (level - slope.clamp(min=0.0) * middle).clamp(min=0.0).minimum(under.amin(-3, keepdim=True))
+    brighter = ((under + 0.02) / (base + 0.02)).amin(-3, keepdim=True)
+    return (light * ((brighter - 1.05) / 0.3).clamp(0.0, 1.0)).clamp(0.0, 0.98)
 
 
 def apply_to_photo(edited: Tree, original: Tree, photo: Image, normals: Normals, mask: Mask, detail: Detail = "ratio") -> Image:
@@ -74,7 +96,9 @@ def apply_to_photo(edited: Tree, original: Tree, photo: Image, normals: Normals,
         parts = split(original, normals, before), split(edited, normals, after)
         black = torch.zeros_like(before)
         (base, lights), (new_base, new_lights) = parts if None not in parts else ((before, black), (after, black))  # type: ignore[misc]
-        gain = base * (1.0 - lights)
+        glint = glints(photo, base, lights)
+        lights, new_lights = (1.0 - (1.0 - part) * (1.0 - glint) for part in (lights, new_lights))
+        before, gain = 1.0 - (1.0 - base) * (1.0 - lights), base * (1.0 - lights)
         texture = (1.0 + (photo - before) * gain / (gain.square() + RIDGE)).clamp(0.0, MOST_TEXTURE)
         explained = 1.0 - (1.0 - texture * base) * (1.0 - lights)
         result = 1.0 - (1.0 - texture * new_base) * (1.0 - new_lights) + (photo - explained)

@@ -87,7 +87,7 @@ def from_ball(
     """The MatCap of a photo of a ball; the ball is found as `read_sphere` does, or given, and may be cut by the frame.
 
     Args:
-        ignore: a picture of the photo's size, white where pixels do not count.
+        ignore: a picture of the photo's size, white where pixels are not of the object; they are not in ``mask`` either.
         even: take texture and shadow out, which on a ball can only be told from shading by their sharp edges.
     Raises:
         PictureError: see `read_sphere`.
@@ -194,9 +194,8 @@ def _encoded(picture: Picture, inside: np.ndarray, exposure: float | None = None
 def _extract(path: str | Path, given: _Object, ignored: Array | None, size: int, even: bool) -> Extraction:
     if size < 16 or size > 2048:
         raise PictureError(f"{path}: expected a size from 16 to 2048, got {size}")
-    valid = given.inside >= OPAQUE
-    if ignored is not None:
-        valid &= ignored < 0.5
+    inside = given.inside if ignored is None else given.inside * (1.0 - ignored)
+    valid = inside >= OPAQUE
     if valid.sum() < LEAST:
         raise PictureError(f"{path}: expected an object of at least {LEAST} pixels, got {int(valid.sum())}")
     step = max(1, int(np.ceil(np.sqrt(valid.sum() / MOST_PIXELS))))
@@ -221,7 +220,7 @@ def _extract(path: str | Path, given: _Object, ignored: Array | None, size: int,
         torch.from_numpy(seen[None]).float(),
         torch.from_numpy(np.ascontiguousarray(np.moveaxis(given.rgb, -1, 0))).float(),
         torch.from_numpy(np.ascontiguousarray(np.moveaxis(given.normals, -1, 0))).float(),
-        torch.from_numpy(given.inside[None]).float(),
+        torch.from_numpy(inside[None]).float(),
         given.how,
         paints=paints,
         unexplained=unexplained,

@@ -75,8 +75,6 @@ def read_mesh(path: str | Path) -> Mesh:
     corners = np.concatenate([part.corners for part in found])
     if len(corners) > MOST_FACES:
         raise PictureError(f"{path}: expected at most {MOST_FACES:,} triangles, got {len(corners):,}; simplify it first")
-    if not np.isfinite(corners).all():
-        raise PictureError(f"{path}: expected finite positions, got NaN or infinity")
     return Mesh(corners, np.concatenate([part.normals for part in found]), any(part.computed for part in found))
 
 
@@ -91,6 +89,8 @@ def _part(scene: Any, node: str) -> Mesh | None:
     vertices = np.asarray(geometry.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     faces = np.asarray(faces, dtype=np.int64)
     corners = vertices[faces]
+    if not np.isfinite(corners).all():
+        raise ValueError("expected finite positions, got NaN or infinity")
     # What the file says; asked for `vertex_normals`, trimesh would compute them without a word.
     given = geometry._cache["vertex_normals"]
     if given is None or len(given) != len(vertices) or not np.isfinite(given).all():

@@ -277,5 +277,6 @@ def separate(image: Array, normals: Array, valid: NDArray[np.bool_]) -> Separati
     paints = tuple(
         Paint((float(r), float(g), float(b)), float((work.labels == k).sum() / total))
         for k, (r, g, b) in enumerate(np.exp(np.array(work.ratios))[1:], start=1)
+        if (work.labels == k).sum() >= SHARE * total
     )
     return Separation(planes, paints, all_weights, all_flat, work.deviation)

@@ -173,7 +173,14 @@ class Drawing:
         zoom = side / max(self.view[2:])
         width, height = (max(1, round(length * zoom)) for length in self.view[2:])
         try:
-            data = resvg_py.svg_to_bytes(svg_string=_text(root), width=width, height=height, resources_dir=str(self.path.parent.resolve()))
+            wordless = not any(_name(element) == "text" for element in root.iter())
+            data = resvg_py.svg_to_bytes(
+                svg_string=_text(root),
+                width=width,
+                height=height,
+                resources_dir=str(self.path.parent.resolve()),
+                skip_system_fonts=wordless,  # reading them takes seconds
+            )
         except ValueError as error:
             raise PictureError(f"{self.path}: cannot be drawn ({str(error).splitlines()[0]})") from None
         with PILImage.open(io.BytesIO(bytes(data))) as image:
