@@ -8,8 +8,9 @@ light, `Program.function` puts the conversion at the end.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import reduce
 from itertools import groupby
 from typing import Literal, TypeAlias
 
@@ -24,6 +25,9 @@ Space: TypeAlias = Literal["srgb", "linear"]
 
 RESERVED = re.compile(r"^(gl|webgl|unity|webgpu|std|leaf)(_|$)")
 """What a name must not begin with: prefixes that shading languages keep for themselves."""
+
+LONGEST = 6
+"""Operands that one statement joins at most."""
 
 
 @dataclass(frozen=True)
@@ -146,19 +150,25 @@ class _Writer:
             (left, right) = (_color(*part) for part in parts)
             text = f"mix({right}, {left}, {mask})"
         elif node.kind == "screen":
-            text = _color(*parts[0])
-            for part in parts[1:]:
-                text = f"screen({text}, {_color(*part)})"
+            text = self.chain([_color(*part) for part in parts], _screened, kind, node.kind, address)
         elif node.kind == "multiply":
             parts.sort(key=lambda part: part[1] == "float")
             kind = "vec3" if parts[0][1] == "vec3" else "float"
-            text = " * ".join(text for text, _ in parts)
+            text = self.chain([text for text, _ in parts], " * ".join, kind, node.kind, address)
         else:
             raise TreeError(f"the operator {node.kind!r} has no translation", address)
         name = self.unique(f"{_identifier(node.name)}_{node.kind}" if _identifier(node.name) else self.numbered(node.kind))
         comment = address if node.name is None else f"{address}: {_line(node.name)}"
         self.statements.append(Statement(name, kind, text, comment))
         return name, kind
+
+    def chain(self, texts: list[str], join: Callable[[list[str]], str], kind: Literal["float", "vec3"], stem: str, comment: str) -> str:
+        """The operands joined, in several statements where there are many: lines stay readable, and compilers' stacks are finite."""
+        while len(texts) > LONGEST:
+            name = self.unique(self.numbered(stem))
+            self.statements.append(Statement(name, kind, join(texts[:LONGEST]), comment))
+            texts = [name, *texts[LONGEST:]]
+        return join(texts)
 
     def numbered(self, kind: str) -> str:
         """``screen_1``: no language keeps a word with a number for itself."""
@@ -190,17 +200,20 @@ class _Writer:
                 label = parameter.name + (f" {lobe + 1}" if leaf.lobes > 1 else "")
                 self.uniforms.append(Uniform(name, "float" if parameter.size == 1 else "vec3", number, parameter, address, title, label))
             lobes.append(names)
-        return _shaded(leaf, address, lobes)
+        if leaf.kind == "environment":
+            lights = [f"{name['color']} * spot(mirrored(n), {name['direction']}, {name['sharpness']})" for name in lobes]
+            return f"min({self.chain(lights, ' + '.join, 'vec3', leaf.kind, address)}, vec3(1.0))", "vec3"
+        return _shaded(leaf, address, lobes[0])
 
 
-def _shaded(leaf: Leaf, address: str, lobes: list[dict[str, str]]) -> tuple[str, str]:
+def _screened(texts: list[str]) -> str:
+    return reduce(lambda below, above: f"screen({below}, {above})", texts)
+
+
+def _shaded(leaf: Leaf, address: str, names: dict[str, str]) -> tuple[str, str]:
     """A leaf as an expression of its uniforms, and the type of that."""
-    names = lobes[0]
     if leaf.kind == "albedo":
         return names["color"], "vec3"
-    if leaf.kind == "environment":
-        lights = (f"{name['color']} * spot(mirrored(n), {name['direction']}, {name['sharpness']})" for name in lobes)
-        return f"min({' + '.join(lights)}, vec3(1.0))", "vec3"
     if leaf.kind in ("image", "image_mask", "environment_map"):
         raster = leaf["pixels"]
         texel = f"vec3({1.0 / raster.width!r}, {1.0 / raster.height!r}, 0.0)"
