@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -70,9 +71,11 @@ def write(result: Result, sphere: SphereImage, folder: Path, which: str, source_
     with staged(folder) as staging:
         dump(result.family, staging / TREE_FILE)
         if which == "all":
-            _write_pictures(result, sphere, staging)
-            (staging / "tree.svg").write_text(drawing.tree_svg(result.tree), encoding="utf-8")
-            (staging / "report.html").write_text(report.report_html(result, sphere, source_name, shown), encoding="utf-8")
+            with ThreadPoolExecutor(1) as beside:  # encoders let go of the interpreter, so both go on at once
+                pictures = beside.submit(_write_pictures, result, sphere, staging)
+                (staging / "tree.svg").write_text(drawing.tree_svg(result.tree), encoding="utf-8")
+                (staging / "report.html").write_text(report.report_html(result, sphere, source_name, shown), encoding="utf-8")
+                pictures.result()
     return folder / TREE_FILE
 
 

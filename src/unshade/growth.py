@@ -37,7 +37,7 @@ class Effort:
     beam_moves: int = 5
     trials: int = 4
     """Moves that are tried by a short fit at each growth."""
-    trial_steps: int = 5
+    trial_steps: int = 4
     growth_steps: int = 12
     rounds: int = 0
     """Times that the least useful leaf is taken out and the tree grown again."""

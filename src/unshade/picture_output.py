@@ -7,6 +7,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,14 @@ def replacing(path: Path) -> Iterator[Path]:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 temporary.unlink()
+
+
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "JPEG": {"quality": 95, "subsampling": 0},
+    "WEBP": {"lossless": True, "exact": True},
+    "PNG": {"compress_level": 4},  # a third of the default's time, a few percent larger
+}
+"""What Pillow is told for each format."""
 
 
 def write_picture(path: str | Path, image: Image, alpha: Mask | None = None, *, bits: int = 8, exposure: float = 1.0) -> None:
@@ -95,9 +104,7 @@ def _writer(
     if bits == 16:
         data = write_png(np.round(np.moveaxis(channels, -1, 0) * 65535).astype(np.uint16))
         return lambda path: _write_bytes(path, data)
-    options: dict[str, object] = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"lossless": True, "exact": True}}.get(
-        _PILLOW[suffix], {}
-    )  # type: ignore[assignment]
+    options = _OPTIONS.get(_PILLOW[suffix], {})
     picture = PILImage.fromarray(np.round(channels * 255).astype(np.uint8))
     return lambda path: picture.save(path, format=_PILLOW[suffix], **options)
 

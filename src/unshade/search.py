@@ -73,7 +73,7 @@ class Search(Growth):
             options = []
             for root in removals(current.root) + swaps(current.root):
                 if count_values(root) <= min(current.values + 2, self.effort.max_values):
-                    quick = fit_pixels(pixels, root, steps=4, softest=FINE_SOFTNESS)
+                    quick = fit_pixels(pixels, root, steps=2, softest=FINE_SOFTNESS)
                     options.append(Candidate(quick.root, quick.error))
             options.sort(key=lambda option: self.judge(option.error, option.values))
             tried = [self.fit(option.root, pixels, self.effort.growth_steps) for option in options[:3]]

@@ -50,7 +50,7 @@ def minimise(
     fresh, slow = True, 0
     for _ in range(steps):
         if fresh:
-            jacobian = model.jacobian(vector, values).mul_(root_weight)
+            jacobian = model.jacobian(vector, values, root_weight)
             flat = jacobian.view(model.free, -1)
             scale = model.scale(vector)
             hessian = (flat @ flat.T).double() * scale[:, None] * scale

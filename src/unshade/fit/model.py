@@ -210,8 +210,8 @@ class Model:
                 gains = BLENDS[node.kind].gains(*(shaded[where] for where, _ in below))
                 stack.extend((where, child, gain * own) for (where, child), own in zip(below, gains, strict=True))
 
-    def jacobian(self, vector: torch.Tensor, values: list[torch.Tensor]) -> torch.Tensor:
-        """d picture / d free coordinates, (F, 3, N)."""
+    def jacobian(self, vector: torch.Tensor, values: list[torch.Tensor], weight: torch.Tensor | float = 1.0) -> torch.Tensor:
+        """d picture / d free coordinates times the ``weight`` of each pixel, (F, 3, N)."""
         count = self.pixels.count
         gains = {address: gain for address, node, _, gain in self.nodes(values) if isinstance(node, Leaf)}
         jacobian = torch.empty(self.free, 3, count, dtype=self.normals.dtype)
@@ -222,7 +222,10 @@ class Model:
                 continue
             rows, width = len(group.leaves), len(group.pattern)
             block = jacobian[group.first : group.first + rows * width].view(rows, width, 3, count)
-            gain = torch.stack([torch.as_tensor(gains[self.addresses[k]], dtype=numbers.dtype).expand(3, count) for k in group.leaves])
+            gain = (
+                torch.stack([torch.as_tensor(gains[self.addresses[k]], dtype=numbers.dtype).expand(3, count) for k in group.leaves])
+                * weight
+            )
             if group.kind == "albedo":
                 block.zero_()
                 for column, (_, channel, _) in enumerate(group.pattern):
