@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from unshade.sphere import sphere_grid
@@ -30,9 +31,13 @@ class ImageEncoder(nn.Module):
             width = min(2 * inputs, widest * channels)
             layers += [convolution(inputs, width, 2), convolution(width, width)]
             inputs, size = width, size // 2
-        self.layers = nn.Sequential(*layers, nn.Conv2d(inputs, outputs, 1))
+        self.layers = nn.Sequential(*layers)
+        self.join = nn.Conv2d(inputs + 48, outputs, 1)
 
     def forward(self, images: Image) -> Tensor:
         """See the class."""
         places = self.places.expand(len(images), -1, -1, -1)
-        return self.layers(torch.cat([2.0 * images - 1.0, places], 1))
+        seen = self.layers(torch.cat([2.0 * images - 1.0, places], 1))
+        # The colours as they are, at 16 x 16: normalised layers know them only beside each other.
+        colors = F.pixel_unshuffle(F.adaptive_avg_pool2d(images, 16), 4)
+        return self.join(torch.cat([seen, 2.0 * colors - 1.0], 1))
