@@ -33,7 +33,7 @@ $(VENV)/.user: pyproject.toml constraints.txt
 
 $(VENV)/.dev: $(VENV)/.user
 	@echo "adding the tools for the checks"
-	@$(PIP) --no-build-isolation --editable '.[exr,video,perceptual,bench,train,dev]'
+	@$(PIP) --no-build-isolation --editable '.[exr,video,perceptual,mesh,svg,bench,train,export,programs,dev]'
 	@touch $@
 
 demo: $(VENV)/.user
@@ -63,6 +63,7 @@ bench: $(VENV)/.dev
 docs: $(VENV)/.dev
 	@$(PY) scripts/gallery.py
 	@$(PY) scripts/dataset_page.py
+	@$(PY) scripts/photographs_pictures.py
 	@$(PY) scripts/cli_reference.py
 	@$(PY) scripts/readme_picture.py
 

@@ -1,6 +1,6 @@
 """Measure what extract and apply are worth on photos with a known answer: known trees on exact normals, with texture and shadow.
 
-    python scripts/measure_photographs.py [--size 384]
+    python scripts/measure_photographs.py [--size 384] [--keep-extract]
 
 - extract: the MatCap of each photo against the picture of the tree that it was made with, PSNR in dB inside the disc of radius
   0.97, of the directions that were seen and of all; and of the plain mean over the pixels of a direction, which is what the
@@ -61,8 +61,8 @@ def decibels(image: torch.Tensor, truth: torch.Tensor, where: torch.Tensor) -> f
     return round(min(float(psnr(image.float(), truth.float(), where)), 99.0), 2)
 
 
-def measure(size: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    rows, edits = [], []
+def measure_extract(size: int) -> list[dict[str, Any]]:
+    rows = []
     with tempfile.TemporaryDirectory() as name:
         for shape in scenes.OBJECTS:
             for kind in scenes.TREES:
@@ -70,7 +70,7 @@ def measure(size: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
                 truth = render(tree, sphere_normals(256))
                 for fault in scenes.FAULTS:
                     begin = time.process_time()
-                    found, image = extracted(Path(name), tree, shape, fault, size, True)
+                    found, _ = extracted(Path(name), tree, shape, fault, size, True)
                     seconds = time.process_time() - begin
                     plain, _ = extracted(Path(name), tree, shape, fault, size, False)
                     seen = DISC & (found.coverage >= 0.5)
@@ -87,9 +87,17 @@ def measure(size: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
                         }
                     )
                     print(rows[-1], flush=True)
-                    if shape == "knot" and fault in ("clean", "patch", "stripes and shadow"):
-                        edits += edited(found, image, tree, kind, fault, size)
-    return rows, edits
+    return rows
+
+
+def measure_apply(size: int) -> list[dict[str, Any]]:
+    rows = []
+    with tempfile.TemporaryDirectory() as name:
+        for kind in scenes.TREES:
+            for fault in ("clean", "patch", "stripes and shadow"):
+                tree = scenes.tree_of(kind)
+                rows += edited(*extracted(Path(name), tree, "knot", fault, size, True), tree, kind, fault, size)
+    return rows
 
 
 def edited(found: Extraction, image: torch.Tensor, tree: Tree, kind: str, fault: str, size: int) -> list[dict[str, Any]]:
@@ -141,9 +149,12 @@ def summed(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=384)
+    parser.add_argument("--keep-extract", action="store_true", help="measure apply again, extract not")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    rows, edits = measure(given.size)
+    path = ROOT / "benchmarks" / "results" / "photographs.json"
+    kept = json.loads(path.read_text(encoding="utf-8"))["extract_cases"] if given.keep_extract else None
+    rows, edits = kept or measure_extract(given.size), measure_apply(given.size)
     document = {
         "machine": machine(),
         "versions": versions(),
@@ -162,7 +173,6 @@ def main() -> None:
         "extract_cases": rows,
         "apply_cases": edits,
     }
-    path = ROOT / "benchmarks" / "results" / "photographs.json"
     path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     print(json.dumps({key: document[key] for key in ("summary", "apply", "inflate")}, indent=1))
 

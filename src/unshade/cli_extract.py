@@ -168,7 +168,7 @@ def _said(found: Extraction, normals: Path | None) -> list[str]:
             + ("" if found.told else "; the map does not show which, say --green directx if it is not")
         )
     if found.guess:
-        lines.append(f"the normals are a guess: the outline was blown up like a balloon")
+        lines.append("the normals are a guess: the outline was blown up like a balloon")
     for paint in found.paints:
         color = ", ".join(f"{number:.2f}" for number in paint.ratio)
         what = "a shadow or grey paint" if paint.shadow else "a paint"
