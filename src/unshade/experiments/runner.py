@@ -49,7 +49,7 @@ def run(options: Options, console: Console | None = None) -> Ran:
     ran = Ran()
 
     def tell(text: str) -> None:
-        console.print(text, markup=False, highlight=False)
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     for part in options.parts:
         if part not in PARTS:
