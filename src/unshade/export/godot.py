@@ -17,8 +17,8 @@ HEAD = """\
 shader_type spatial;
 render_mode unshaded;
 
-// Made by unshade, for Godot 4.4 and later. Forward+ and Mobile give picked colours as linear light and want linear light back; Compatibility works on
-// sRGB at both ends. The tree converts where its own numbers are of the other kind.
+// Made by unshade, for Godot 4.4 and later. Forward+ and Mobile give picked colours as linear light and want linear light
+// back; Compatibility works on sRGB at both ends. The tree converts where its own numbers are of the other kind.
 """
 
 FRAGMENT = """
