@@ -9,7 +9,7 @@
   The same with the known tree in the place of the recovered one says what of the error is `apply`'s own.
 - inflate: the angle between the guessed and the true normals of a disc, and of the pebble.
 
-Writes benchmarks/results/photographs.json.
+Writes benchmarks/results/photographs/photographs.json.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def main() -> None:
     parser.add_argument("--keep-extract", action="store_true", help="measure apply again, extract not")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    path = ROOT / "benchmarks" / "results" / "photographs.json"
+    path = ROOT / "benchmarks" / "results" / "photographs" / "photographs.json"
     kept = json.loads(path.read_text(encoding="utf-8"))["extract_cases"] if given.keep_extract else None
     rows, edits = kept or measure_extract(given.size), measure_apply(given.size)
     document = {
