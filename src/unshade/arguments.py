@@ -69,6 +69,10 @@ def read_document(source: str, text_only: bool = False) -> tuple[Tree, Family | 
 
     path = None if text_only or source == "-" else tree_file(source)
     try:
+        if path is not None and path.suffix.lower() == ".psd":
+            from unshade.export.psd import read_psd
+
+            return read_psd(path), None
         if path is not None:
             tree, text = serde.load(path), path.read_text(encoding="utf-8")
         elif source == "-" or text_only or "(" in source:

@@ -10,7 +10,8 @@ from typing import Any
 import click
 
 from unshade.arguments import read_tree
-from unshade.export.targets import OPTIONS, TARGETS, Option
+from unshade.errors import UnshadeError
+from unshade.export.targets import OPTIONS, TARGETS, Option, target_of
 
 
 def _click_option(option: Option) -> Callable[[Any], Any]:
@@ -36,9 +37,9 @@ def _list_targets(context: click.Context, _parameter: click.Parameter, wanted: b
         return
     for target in TARGETS.values():
         state = "experimental" if target.experimental else f"checked in {target.checked_by}"
-        click.echo(f"{target.name:12} {'/'.join(target.suffixes):14} {target.summary}; {state}")
+        click.echo(f"{target.name:14} {'/'.join(target.suffixes):14} {target.summary}; {state}")
         for loss in target.losses:
-            click.echo(f"{'':27} cannot hold {loss.cannot}: {loss.instead}")
+            click.echo(f"{'':29} cannot hold {loss.cannot}: {loss.instead}")
     context.exit()
 
 
@@ -63,12 +64,16 @@ def export(tree: str, name: str | None, output: Path, quiet: bool, **options: An
       unshade export out/ball --to png -o matcap.png --bits 16
       unshade export out/ball -o heart.svg --shape drawing.svg --region heart
     """
-    from unshade.export import ExportWarning
+    from unshade.export import ExportWarning, check_options
     from unshade.export import export as write
     from unshade.terminal import Messages
 
     target = name if name is not None else _target_by_suffix(output)
     given = {option: value for option, value in options.items() if value is not None}
+    try:
+        check_options(target_of(target), given)
+    except UnshadeError as error:
+        raise click.UsageError(str(error)) from None
     found = read_tree(tree)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from unshade.export.targets import OPTIONS, TARGETS, Target, target_of
 if TYPE_CHECKING:
     from unshade.nodes import Tree
 
-__all__ = ["OPTIONS", "TARGETS", "ExportWarning", "Target", "degradations", "export", "target_of"]
+__all__ = ["OPTIONS", "TARGETS", "ExportWarning", "Target", "check_options", "degradations", "export", "target_of"]
 
 
 class ExportWarning(UserWarning):
@@ -57,8 +58,7 @@ def export(tree: Tree, path: str | os.PathLike[str], target: str, **options: Any
         raise OutputError(
             f"{path}: {target} expects a name that ends in {' or '.join(chosen.suffixes)}, got {path.suffix or 'no suffix'!r}"
         )
-    for name, value in options.items():
-        _check_option(chosen, name, value)
+    check_options(chosen, options)
     for sentence in degradations(tree, chosen):
         warnings.warn(sentence, ExportWarning, stacklevel=2)
     module, function = chosen.writer.split(".")
@@ -67,6 +67,12 @@ def export(tree: Tree, path: str | os.PathLike[str], target: str, **options: Any
         for sentence in write(tree, temporary, **options) or ():
             warnings.warn(f"{target}: {sentence}", ExportWarning, stacklevel=2)
     return path
+
+
+def check_options(target: Target, options: Mapping[str, Any]) -> None:
+    """Raises UnshadeError for an option that the target does not take, or one out of range."""
+    for name, value in options.items():
+        _check_option(target, name, value)
 
 
 def _check_option(target: Target, name: str, value: Any) -> None:

@@ -58,7 +58,12 @@ def write_blender_matcap(tree: Tree, path: Path, size: int = 512, padding: int =
     form = padded(dataclasses.replace(tree, root=part(tree.root, "diffuse")), size, padding)
     diffuse, whole = (srgb_decode(shown.double().clamp(0.0, 1.0)) / tree.exposure for shown in (form, padded(tree, size, padding)))
     layers = {"diffuse": diffuse, "specular": (whole - diffuse).clamp(min=0.0)}
-    channels = {f"{name}.{letter}": light[k].half().numpy() for name, light in layers.items() for k, letter in enumerate("RGB")}
+    opaque = torch.ones_like(diffuse[0])
+    channels = {
+        f"{name}.{letter}": plane.half().numpy()
+        for name, light in layers.items()
+        for letter, plane in zip("RGBA", (*light, opaque), strict=True)
+    }
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, channels) as file:
         file.write(str(path))
