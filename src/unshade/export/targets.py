@@ -80,6 +80,14 @@ def of_kinds(*kinds: str) -> Callable[[Tree], list[str]]:
     return lambda tree: [address for address, node in tree.walk() if node.kind in kinds]
 
 
+def masked_groups(tree: Tree) -> list[str]:
+    """The mixes whose left side, which takes the mask, is several nodes."""
+    from unshade.nodes import Operator
+
+    mixes = ((address, node) for address, node in tree.walk() if isinstance(node, Operator) and node.kind == "mix")
+    return [address for address, node in mixes if isinstance(node.children[0], Operator)]
+
+
 def linear(tree: Tree) -> list[str]:
     """The operators of a tree that works on linear light; a single leaf blends nothing."""
     return [address for address, node in tree.walk() if node.kind in ("multiply", "screen", "mix")] if tree.blend_space == "linear" else []
@@ -100,7 +108,7 @@ FLAT = Loss("a leaf's parameters", "it becomes pixels", lambda tree: [])
 MERGED = Loss(
     "a mask over several nodes",
     "they become one layer with the mask as its transparency",
-    lambda tree: [address for address, node in tree.walk() if node.kind == "mix" and not hasattr(node.children[0], "values")],
+    masked_groups,
 )
 ADDED = Loss("nodes and a screen", "the tree becomes two layers whose sum in linear light is its picture", lambda tree: [])
 BOUND = Loss("the picture of a leaf", "it becomes a texture to bind by hand, as PNG data in a comment at the end", RASTERS)
