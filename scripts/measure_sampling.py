@@ -49,9 +49,8 @@ def main() -> None:
         for level in ("top", "bottom"):
             net = getattr(priors.first, level)
             fast, slow, same = measure(net, config, samples, device)
-            print(
-                f"| {level}, {net.size} x {net.size} | {samples} | {fast:.3f} | {slow:.2f} | {slow / fast:.1f} | {'yes' if same else 'no'} |"
-            )
+            codes, agree = f"{level}, {net.size} x {net.size}", "yes" if same else "no"
+            print(f"| {codes} | {samples} | {fast:.3f} | {slow:.2f} | {slow / fast:.1f} | {agree} |")
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def write(options: Options, rows: Sequence[Row], skipped: dict[str, str], failed
                 results / f"{dataset}.{method}.json".replace(":", "-"),
                 json.dumps(document(options, dataset, method, chosen), indent=1) + "\n",
             )
-        documents = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(results.glob("*.json"))]
+        documents = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(results.glob("*.*.json"))]
         _write_text(options.out / "results.md", table(documents))
         _draw(lambda: plot.curves(documents, options.out), console)
         _draw(lambda: sheet.worst(options, rows, options.out / "sheets"), console)
