@@ -65,6 +65,7 @@ docs: $(VENV)/.dev
 	@$(PY) scripts/dataset_page.py
 	@$(PY) scripts/photographs_pictures.py
 	@$(PY) scripts/cli_reference.py
+	@$(PY) scripts/export_page.py
 	@$(PY) scripts/readme_picture.py
 
 clean:

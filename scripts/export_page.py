@@ -30,10 +30,9 @@ export(tree, "ball.svg", "svg")
 ```
 
 Every target is a translation of the one renderer, and is tested on the same fixture trees (`tests/export_trees.py`: every leaf,
-operator, nesting and mask) against it.
-What a target cannot hold is said by `export` as an `ExportWarning` and by the command on standard error, with the nodes it
-happens to and what becomes of them. A target is
-*experimental* until a program of its own world has read it in the tests.
+operator, nesting and mask) against it. What a target cannot hold is said by `export` as an `ExportWarning` and by the command on
+standard error, with the nodes it happens to and what becomes of them. A target is *experimental* until a program of its own world has
+read it in the tests.
 
 ## Targets
 
@@ -42,16 +41,13 @@ happens to and what becomes of them. A target is
 VECTORS = """
 ## Vector art
 
-A parametric leaf becomes gradients and paths, never pixels. At one height `z` of the sphere every leaf is a linear gradient along
-its light, so a few of them, each faded into the
-next by a mask that depends on `z` alone, draw it from any side. Where the lines of equal brightness close around a spot they are
-ellipses, and a chain of radial gradients whose focus is
-the apex of the cone through two of them draws those. A hard edge is one exact path. Each leaf takes the smallest of these
-drawings that is within 58 dB of it
-(`src/unshade/export/vectors.py`). `--shape` puts the shading on a closed path of an SVG in the sphere's place: the sphere's
-picture is stretched to the smallest ellipse
-around the path with the proportions of its bounding box, so that the path's normals are those of an ellipsoid that it is cut out
-of, not of the path blown up.
+A parametric leaf becomes gradients and paths, never pixels. At one height `z` of the sphere every leaf is a linear gradient along its
+light, so a few of them, each faded into the next by a mask that depends on `z` alone, draw it from any side. Where the lines of equal
+brightness close around a spot they are ellipses, and a chain of radial gradients whose focus is the apex of the cone through two of
+them draws those. A hard edge is one exact path. Each leaf takes the smallest of these drawings that is within 58 dB of it
+(`src/unshade/export/vectors.py`). `--shape` puts the shading on a closed path of an SVG in the sphere's place: the sphere's picture is
+stretched to the smallest ellipse around the path with the proportions of its bounding box, so that the path's normals are those of an
+ellipsoid that it is cut out of, not of the path blown up.
 
 The groups carry the addresses of the nodes and their names, and Inkscape and PDF viewers list them as layers. Blend modes work on
 encoded values in all three formats.
@@ -61,11 +57,10 @@ encoded values in all three formats.
 LAYERS = """
 ## Layered files
 
-Each leaf is a pixel layer that reaches past the silhouette, each operator an isolated group, and the root is masked by the
-sphere. A PSD keeps the tree in its metadata:
-`unshade.export.psd.read_psd` gives it back, less the layers that were hidden or deleted, with new colours of albedo layers and
-new names; a TREE on the command line may be such a file.
-Other paint in a layer cannot be read back. Masks have 8 bits of precision also in a file of 16.
+Each leaf is a pixel layer that reaches past the silhouette, each operator an isolated group, and the root is masked by the sphere. A
+PSD keeps the tree in its metadata: `unshade.export.psd.read_psd` gives it back, less the layers that were hidden or deleted, with new
+colours of albedo layers and new names; a TREE on the command line may be such a file. Other paint in a layer cannot be read back. Masks
+have 8 bits of precision also in a file of 16.
 
 """
 
@@ -81,7 +76,8 @@ whole, `decode(all) - decode(form)`: the sum is the tree's picture, and Blender'
 
 
 def row(target: Target) -> str:
-    """One line of the table."""
+    
+"""One line of the table."""
     state = f"experimental: {target.short_of or 'no program has checked it'}" if target.experimental else f"{target.checked_by}"
     lost = "; ".join(f"{loss.cannot}: {loss.instead}" for loss in target.losses) or "nothing"
     options = ", ".join(f"`--{name}`" for name in target.options) or "none"
