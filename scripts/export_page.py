@@ -44,13 +44,13 @@ VECTORS = """
 A parametric leaf becomes gradients and paths, never pixels. At one height `z` of the sphere every leaf is a linear gradient along its
 light, so a few of them, each faded into the next by a mask that depends on `z` alone, draw it from any side. Where the lines of equal
 brightness close around a spot they are ellipses, and a chain of radial gradients whose focus is the apex of the cone through two of
-them draws those. A hard edge is one exact path. Each leaf takes the smallest of these drawings that is within 58 dB of it
+them draws those. A hard edge is one exact path. Each leaf takes the smallest of these drawings that is within 56 dB of it, or the nearest
 (`src/unshade/export/vectors.py`). `--shape` puts the shading on a closed path of an SVG in the sphere's place: the sphere's picture is
 stretched to the smallest ellipse around the path with the proportions of its bounding box, so that the path's normals are those of an
 ellipsoid that it is cut out of, not of the path blown up.
 
-The groups carry the addresses of the nodes and their names, and Inkscape and PDF viewers list them as layers. Blend modes work on
-encoded values in all three formats.
+The groups of an SVG carry the nodes' addresses as `id` and their names as `inkscape:label`; a PDF has a layer for each node. Blend
+modes work on encoded values in all three formats. Neither Inkscape nor Illustrator has been tried.
 
 """
 
@@ -68,16 +68,15 @@ MATCAPS = """
 ## MatCaps
 
 `png` and `exr` fill the square: past the silhouette every pixel has the colour of the silhouette's nearest point, and `--padding`
-leaves room for it on all sides. Blender adds the
-`diffuse` and `specular` layers of a MatCap in linear light, where a tree screens encoded values. So `blender-matcap` stores as
-`specular` what the lights add to the light of the
-whole, `decode(all) - decode(form)`: the sum is the tree's picture, and Blender's switch for specular lighting leaves the form.
+leaves room for it on all sides. Blender adds the `diffuse` and `specular` layers of a MatCap in linear light, where a tree screens
+encoded values. So `blender-matcap` stores as `specular` what the lights add to the light of the whole, `decode(all) - decode(form)`:
+the sum is the tree's picture, and without it the form is left.
+Blender 5.0 reads the layers; that they add up is tested by reading them here.
 """
 
 
 def row(target: Target) -> str:
-    
-"""One line of the table."""
+    """One line of the table."""
     state = f"experimental: {target.short_of or 'no program has checked it'}" if target.experimental else f"{target.checked_by}"
     lost = "; ".join(f"{loss.cannot}: {loss.instead}" for loss in target.losses) or "nothing"
     options = ", ".join(f"`--{name}`" for name in target.options) or "none"
