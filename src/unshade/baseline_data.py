@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import count, islice
-from typing import Any
 
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
 from unshade.decoded import SIZE, leaf_of
 from unshade.forest import Forest
@@ -19,7 +18,7 @@ from unshade.nodes import Leaf, Node, Operator, Raster, Tree, leaf
 from unshade.render import render
 from unshade.shading import rotate
 from unshade.sphere import disc_mask, sphere_normals
-from unshade.synthesis import GROVE, Style, plants
+from unshade.synthesis import GROVE, Style, ahead, plants
 from unshade.types import Image
 
 
@@ -64,24 +63,7 @@ def tree_batches(
     if not workers:
         yield from (made[number].to(device) for number in count(start))
         return
-    loader = DataLoader(
-        made, batch_size=None, sampler=_Counted(start), num_workers=workers, collate_fn=_as_it_is, multiprocessing_context="spawn"
-    )
-    yield from (found.to(device) for found in loader)
-
-
-@dataclass(frozen=True)
-class _Counted:
-    """A `DataLoader` sampler that never ends."""
-
-    first: int
-
-    def __iter__(self) -> Iterator[int]:
-        return count(self.first)
-
-
-def _as_it_is(batch: Any) -> Any:
-    return batch
+    yield from (found.to(device) for found in ahead(made, start, workers))
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,7 @@ def read_mesh(path: str | Path) -> Mesh:
         scene = trimesh.load_scene(path, process=False, maintain_order=True, skip_materials=True)
         parts = [_part(scene, node) for node in scene.graph.nodes_geometry]
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, OSError, struct.error, NotImplementedError) as error:
+        # What trimesh raises for damaged files; the last for a format that it has no reader of.
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise PictureError(f"{path}: damaged, or no mesh that can be read ({reason})") from None
     found = [part for part in parts if part is not None and part.faces]

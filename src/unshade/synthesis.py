@@ -127,16 +127,7 @@ def batches(
     first = start // mixed
     loaded: Iterator[Batch]
     if workers:
-        # Spawned: a fork of a process with threads or a GPU may hang.
-        loader = DataLoader(
-            blocks,
-            batch_size=None,
-            sampler=_Counted(first),
-            num_workers=workers,
-            prefetch_factor=2,
-            collate_fn=_as_it_is,
-            multiprocessing_context="spawn",
-        )
+        loader = ahead(blocks, first, workers)
         loaded = iter(loader)
     else:
         loaded = (blocks[number] for number in count(first))
@@ -246,6 +237,20 @@ class _Blocks(Dataset):
         rows = torch.from_numpy(forest.operators())
         assert len(rows) >= wanted, f"{len(rows)} examples where {wanted} are needed"
         return render_examples(forest, rows[torch.randperm(len(rows), generator=generator)[:wanted]], self.size)
+
+
+def ahead(batches: Dataset[Any], first: int, workers: int) -> DataLoader[Any]:
+    """Batches ``first``, ``first`` + 1, ... of an endless set, prepared in other processes."""
+    # Spawned: a fork of a process with threads or a GPU may hang.
+    return DataLoader(
+        batches,
+        batch_size=None,
+        sampler=_Counted(first),
+        num_workers=workers,
+        prefetch_factor=2,
+        collate_fn=_as_it_is,
+        multiprocessing_context="spawn",
+    )
 
 
 @dataclass(frozen=True)
