@@ -30,6 +30,18 @@ class OptionalDisc(Disc):
 FILE = click.Path(path_type=Path)
 
 
+_GREEN = click.option(
+    "--green",
+    type=click.Choice(["auto", "opengl", "directx"]),
+    default="auto",
+    show_default=True,
+    help="Which way the normal map's green points.",
+)
+_SPACE = click.option(
+    "--space", type=click.Choice(["auto", "tangent", "camera"]), default="auto", show_default=True, help="What the normal map's axes are."
+)
+
+
 @click.command()
 @click.argument("photo", type=FILE, metavar="PHOTO")
 @click.option(
@@ -38,16 +50,8 @@ FILE = click.Path(path_type=Path)
 @click.option("--normals", type=FILE, metavar="FILE", help="A normal map of the object, of the photo's size.")
 @click.option("--mask", type=FILE, metavar="FILE", help="The object's outline, white or opaque; its normals are guessed by inflating it.")
 @click.option("--region", metavar="ID", help="Of an SVG: the shape or group whose shading is lifted off.")
-@click.option(
-    "--green",
-    type=click.Choice(["auto", "opengl", "directx"]),
-    default="auto",
-    show_default=True,
-    help="Which way the normal map's green points.",
-)
-@click.option(
-    "--space", type=click.Choice(["auto", "tangent", "camera"]), default="auto", show_default=True, help="What the normal map's axes are."
-)
+@_GREEN
+@_SPACE
 @click.option(
     "--texture",
     type=click.Choice(["auto", "keep", "remove"]),
@@ -189,16 +193,8 @@ def _said(found: Extraction, normals: Path | None) -> list[str]:
     show_default=True,
     help="How the photo's detail comes along: as a texture under the lights, or added.",
 )
-@click.option(
-    "--green",
-    type=click.Choice(["auto", "opengl", "directx"]),
-    default="auto",
-    show_default=True,
-    help="Which way the normal map's green points.",
-)
-@click.option(
-    "--space", type=click.Choice(["auto", "tangent", "camera"]), default="auto", show_default=True, help="What the normal map's axes are."
-)
+@_GREEN
+@_SPACE
 @click.option("--drawing", type=FILE, metavar="SVG", help="Shade a shape of a drawing instead; -o is then an SVG too.")
 @click.option("--region", metavar="ID", help="The shape or group of the drawing.")
 @click.option("--mesh", type=FILE, metavar="FILE", help="Shade a mesh instead: GLB, glTF, OBJ, PLY, STL or OFF.")
