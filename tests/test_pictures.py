@@ -524,6 +524,16 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, name: str) -> None:
     assert "\n" not in str(raised.value) and name in str(raised.value)
 
 
+@needs_exr
+def test_a_truncated_exr_prints_nothing_of_its_own(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    write_picture(tmp_path / "whole.exr", torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0)))
+    data = (tmp_path / "whole.exr").read_bytes()
+    (tmp_path / "cut.exr").write_bytes(data[: len(data) // 2])
+    with pytest.raises(PictureError, match="damaged or truncated EXR"):
+        read_picture(tmp_path / "cut.exr")
+    assert capfd.readouterr() == ("", "")
+
+
 def test_missing_files_and_directories(tmp_path: Path) -> None:
     with pytest.raises(PictureError, match="no such file"):
         read_sphere(tmp_path / "missing.png")

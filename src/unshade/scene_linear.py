@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -66,6 +69,21 @@ def _openexr(path: Path) -> Any:
     return OpenEXR
 
 
+@contextlib.contextmanager
+def _unheard() -> Iterator[None]:
+    """Nothing of what the library prints about a damaged file, on standard output from Python and on standard error from C:
+    the error that it raises says it, and the first may be a program's input."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.ExitStack() as after:
+        with contextlib.suppress(OSError):
+            kept = os.dup(2)
+            after.callback(os.close, kept)
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            after.callback(os.close, nowhere)
+            os.dup2(nowhere, 2)
+            after.callback(os.dup2, kept, 2)
+        yield
+
+
 def read_exr(path: Path, check_size: CheckSize, colors: bool = True) -> tuple[Array, Array | None]:
     """The colour of an OpenEXR file in linear sRGB primaries, (H, W, 3), not premultiplied, and its alpha.
 
@@ -75,7 +93,7 @@ def read_exr(path: Path, check_size: CheckSize, colors: bool = True) -> tuple[Ar
     """
     library = _openexr(path)
     try:
-        with library.File(str(path), header_only=True) as file:
+        with _unheard(), library.File(str(path), header_only=True) as file:
             header = dict(file.header())
     except (RuntimeError, ValueError, TypeError, OSError) as error:
         raise PictureError(f"{path}: damaged or truncated EXR ({str(error).splitlines()[0]})") from None
@@ -84,7 +102,7 @@ def read_exr(path: Path, check_size: CheckSize, colors: bool = True) -> tuple[Ar
     shown_low, shown_high = (np.asarray(corner, dtype=np.int64) for corner in header["displayWindow"])
     check_size(path, *(int(k) for k in shown_high - shown_low + 1))
     try:
-        with library.File(str(path), separate_channels=True) as file:
+        with _unheard(), library.File(str(path), separate_channels=True) as file:
             channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError, OSError) as error:
         raise PictureError(f"{path}: damaged or truncated EXR ({str(error).splitlines()[0]})") from None
