@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
 from export_trees import SRGB, TREES  # noqa: E402
-from renderers import by_chromium, by_pdfium, by_poppler, by_resvg, expected, psnr, rendered, scored  # noqa: E402
+from renderers import by_chromium, by_pdfium, by_poppler, by_psd_tools, by_pyora, by_resvg, expected, psnr, rendered, scored  # noqa: E402
 
 RESULT = ROOT / "benchmarks" / "results" / "export.json"
 SMALL, SIZES = 256, (512, 2048)
@@ -78,21 +78,17 @@ def vectors(folder: Path, browser: str | None) -> dict[str, dict[str, float]]:
 
 def layers(folder: Path) -> dict[str, float]:
     """For each layered format the greatest difference over the fixture trees, of 255."""
-    import pyora
-    from psd_tools import PSDImage
-    from psd_tools.composite import composite
-
     found: dict[str, float] = {}
     for name, tree in {**SRGB, "balanced": load(ROOT / "tests" / "fixtures" / "balanced.json")}.items():
         truth, inside = rendered(tree, 128), scored(128)
         group = "balanced" if name == "balanced" else "fixtures"
         for bits in (8, 16):
             write_psd(tree, folder / "tree.psd", 128, bits)
-            shown = composite(PSDImage.open(folder / "tree.psd"), force=True, color=0.0)[0]
+            shown = by_psd_tools(folder / "tree.psd")[..., :3]
             key = f"psd {bits} bit in psd-tools, {group}"
             found[key] = max(found.get(key, 0.0), 255 * float(np.abs(shown - truth)[inside].max()))
         write_ora(tree, folder / "tree.ora", 128)
-        shown = np.asarray(pyora.Renderer(pyora.Project.load(str(folder / "tree.ora"))).render())[..., :3] / 255.0
+        shown = by_pyora(folder / "tree.ora")[..., :3]
         key = f"ora 8 bit in pyora, {group}"
         found[key] = max(found.get(key, 0.0), 255 * float(np.abs(shown - truth)[inside].max()))
     return found

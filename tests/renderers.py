@@ -1,8 +1,9 @@
-"""Pictures that other programs make of vector files, and what `render` would make of their tree."""
+"""Pictures that other programs make of vector and layered files, and what `render` would make of their tree."""
 
 from __future__ import annotations
 
 import io
+import os
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -68,6 +69,31 @@ def by_poppler(path: Path, size: int) -> np.ndarray:
         pytest.skip("needs Poppler (apt-get install poppler-utils)")
     done = subprocess.run(["pdftoppm", "-png", "-r", str(72 * size / 512), str(path)], capture_output=True, check=True, timeout=120)
     return decoded(done.stdout)[:size, :size]
+
+
+def by_psd_tools(path: Path) -> np.ndarray:
+    """(H, W, 4): what psd-tools makes of the layers of a PSD, not the picture that is stored beside them."""
+    psd_tools = pytest.importorskip("psd_tools", reason="needs psd-tools")
+    from psd_tools.composite import composite
+
+    color, _, alpha = composite(psd_tools.PSDImage.open(path), force=True, color=0.0)
+    return np.concatenate([color, alpha], axis=-1)
+
+
+def by_pyora(path: Path) -> np.ndarray:
+    """(H, W, 4): what pyora makes of the layers of an OpenRaster file."""
+    pyora = pytest.importorskip("pyora", reason="needs pyora")
+    return np.asarray(pyora.Renderer(pyora.Project.load(str(path))).render()) / 255.0
+
+
+def by_krita(path: Path) -> np.ndarray:
+    """(H, W, 4): what Krita makes of a file."""
+    if not (shutil.which("krita") and shutil.which("xvfb-run")):
+        pytest.skip("needs Krita and Xvfb (apt-get install krita xvfb xauth)")
+    picture = path.with_suffix(".krita.png")
+    command = ["xvfb-run", "-a", "krita", "--export", "--export-filename", str(picture), str(path)]
+    subprocess.run(command, env={**os.environ, "HOME": str(path.parent)}, capture_output=True, timeout=200, check=False)
+    return np.asarray(Image.open(picture).convert("RGBA")) / 255.0
 
 
 def by_chromium(browser: str, folder: Path, parts: Sequence[str], size: int, head: str = "") -> list[np.ndarray]:

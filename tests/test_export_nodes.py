@@ -3,55 +3,33 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 
+from blender_pictures import blender_or_skip, by_cycles, run_in_blender
 from chromium import shaders
 from export_trees import LEAVES, TREES
 from test_export_shaders import NEAR, PROGRAMS, assert_near, expected, hostile_tree, psnr
 from unshade.errors import MissingExtraError, OutputError
 from unshade.export import ExportWarning, export
 from unshade.export import blender as blender_target
-from unshade.export.blender import command, script
+from unshade.export.blender import script
 from unshade.export.materialx import materialx
 from unshade.export.program import program
 from unshade.nodes import Tree
-from unshade.png import read_png
 from unshade.rasters import raster_from_png
-
-HERE = Path(__file__).parent
-
-
-@pytest.fixture
-def blender() -> list[str]:
-    """How to run a script in Blender; the test is skipped where there is none."""
-    try:
-        return command()
-    except MissingExtraError as error:
-        pytest.skip(str(error))
-
-
-def drawn(start: list[str], folder: Path, size: int) -> dict[str, np.ndarray]:
-    """What Cycles draws of the scripts and .blend files of a folder, (3, size, size) each."""
-    separator = ["--"] if "--python" in start else []
-    done = subprocess.run(
-        [*start, str(HERE / "blender_cycles.py"), *separator, str(folder), str(size)], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    return {path.stem: read_png(path.read_bytes())[:3] / 65535.0 for path in folder.glob("*.png")}
 
 
 @pytest.mark.slow
-def test_blender_cycles(blender: list[str], tmp_path: Path) -> None:
+def test_blender_cycles(tmp_path: Path) -> None:
+    blender_or_skip()
     for name, tree in TREES.items():
         export(tree, tmp_path / f"{name}.py", "blender")
     export(TREES["lit"], tmp_path / "file.blend", "blender")
     export(hostile_tree(), tmp_path / "hostile.py", "blender")
-    found = drawn(blender, tmp_path, 128)
+    found = by_cycles(tmp_path, 128)
     assert psnr(found.pop("hostile"), expected(hostile_tree(), 128)) >= NEAR
     assert psnr(found.pop("file"), expected(TREES["lit"], 128)) >= NEAR
     assert set(found) == set(TREES)
@@ -73,13 +51,11 @@ print("FOUND", json.dumps(found))
 
 
 @pytest.mark.slow
-def test_blend_has_a_ranged_socket_for_every_parameter(blender: list[str], tmp_path: Path) -> None:
+def test_blend_has_a_ranged_socket_for_every_parameter(tmp_path: Path) -> None:
+    blender_or_skip()
     path = export(TREES["tinted"], tmp_path / "tree.blend", "blender")
     (tmp_path / "sockets.py").write_text(SOCKETS, encoding="utf-8")
-    separator = ["--"] if "--python" in blender else []
-    printed = subprocess.run(
-        [*blender, str(tmp_path / "sockets.py"), *separator, str(path)], capture_output=True, text=True, check=True
-    ).stdout
+    printed = run_in_blender(tmp_path / "sockets.py", path)
     found = json.loads(printed.partition("FOUND ")[2].splitlines()[0])
     assert list(found) == ["Normal", "albedo color", "highlight direction", "highlight sharpness", "highlight amplitude"]
     assert found["highlight sharpness"] == ["highlight", 60.0, pytest.approx(0.05), 5000.0]

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import os
 import re
-import shutil
 import subprocess
 import warnings
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from chromium import NORMAL, OPTIONS, Job, decoded, posted_by, shaders
+from chromium import OPTIONS, Job, decoded, shaders
 from export_trees import TREES
 from godot_web import godot_pictures
+from shader_pictures import (
+    ES,
+    by_three,
+    by_wgpu,
+    compiled,
+    fragment,
+    glsl_job,
+    glslang_or_skip,
+    hlsl_job,
+    unity_properties,
+    wgpu_or_skip,
+    wgsl_module,
+)
 from unshade.errors import TreeError
 from unshade.export import ExportWarning, export
 from unshade.export.formulas import SOURCE, functions
@@ -26,10 +35,10 @@ from unshade.export.glsl import glsl
 from unshade.export.godot import godot
 from unshade.export.program import Program, program
 from unshade.export.three import module, page
-from unshade.export.unity import hlsl, unity
-from unshade.export.wgsl import offsets, wgsl
+from unshade.export.unity import unity
+from unshade.export.wgsl import wgsl
 from unshade.nodes import KINDS, Kind, Leaf, Parameter, Role, Tree, leaf, multiply, screen
-from unshade.render import render, srgb_decode, srgb_encode
+from unshade.render import render, srgb_encode
 from unshade.sphere import disc_mask, sphere_normals
 
 PROGRAMS = {name: program(tree) for name, tree in TREES.items()}
@@ -56,10 +65,6 @@ def assert_near(pictures: dict[str, np.ndarray], near: float = NEAR) -> None:
     assert pictures
     figures = {name: round(psnr(picture, expected(TREES[name], picture.shape[-1])), 1) for name, picture in pictures.items()}
     assert min(figures.values()) >= near, {name: figure for name, figure in figures.items() if figure < near}
-
-
-def numbers(made: Program) -> dict[str, float | list[float]]:
-    return {item.name: item.value[0] if item.type == "float" else list(item.value) for item in made.uniforms}
 
 
 def hostile_tree() -> Tree:
@@ -157,38 +162,25 @@ def test_export_writes_them_and_says_what_is_lost(tmp_path: Path) -> None:
         export(many, tmp_path / "many.glsl", "glsl")
 
 
-def fragment(made: Program, head: str = "#version 300 es\nprecision highp float;\n") -> str:
-    return f"{head}{NORMAL}{glsl(made)}out vec4 color;\nvoid main() {{ color = vec4(unshade(unit_normal()), 1.0); }}\n"
-
-
 @pytest.mark.slow
 @pytest.mark.browser
 def test_glsl_in_chromium(browser: str, tmp_path: Path) -> None:
-    jobs = {name: Job(fragment(made), numbers(made), {p.name: p.raster for p in made.pictures}) for name, made in PROGRAMS.items()}
-    constants = Job(fragment(PROGRAMS["nested"]).replace("out vec4", "out vec4", 1), {}, {})
-    hostile = program(hostile_tree())
-    jobs["constants"] = Job(constants.source.replace("precision highp float;", "precision highp float;\n#define UNSHADE_CONSTANTS"), {}, {})
-    jobs["hostile"] = Job(fragment(hostile), numbers(hostile), {})
+    jobs = {name: glsl_job(made) for name, made in PROGRAMS.items()}
+    jobs["constants"] = Job(fragment(PROGRAMS["nested"], f"{ES}#define UNSHADE_CONSTANTS\n"), {}, {})
+    jobs["hostile"] = glsl_job(program(hostile_tree()))
     found = shaders(browser, tmp_path, jobs, SIZE)
     np.testing.assert_allclose(found.pop("constants"), found["nested"], atol=1.01 / 255)
     assert psnr(found.pop("hostile"), expected(hostile_tree())) >= NEAR
     assert_near(found)
 
 
-def compiled(arguments: list[str], folder: Path) -> None:
-    done = subprocess.run(["glslangValidator", *arguments], capture_output=True, text=True, cwd=folder, check=False)
-    assert done.returncode == 0, done.stdout
-
-
 @pytest.fixture(scope="module")
 def glslang() -> str:
-    if not shutil.which("glslangValidator"):
-        pytest.skip("needs glslang (apt-get install glslang-tools)")
-    return "glslangValidator"
+    return glslang_or_skip()
 
 
 def test_glsl_by_glslang(glslang: str, tmp_path: Path) -> None:
-    for head in ("#version 330\n", "#version 300 es\nprecision highp float;\n", "#version 330\n#define UNSHADE_CONSTANTS\n"):
+    for head in ("#version 330\n", ES, "#version 330\n#define UNSHADE_CONSTANTS\n"):
         for name in ("mix-in-mix", "rasters", "linear-mix", "environment"):
             (tmp_path / "tree.frag").write_text(fragment(PROGRAMS[name], head).replace("SIZE", "64"), encoding="utf-8")
             compiled(["tree.frag"], tmp_path)
@@ -202,29 +194,6 @@ cbuffer Frame { float4x4 UNITY_MATRIX_V; float4x4 UNITY_MATRIX_VP; float4x4 unit
 float4 UnityObjectToClipPos(float4 place) { return mul(UNITY_MATRIX_VP, mul(unity_ObjectToWorld, place)); }
 """
 """What the shader takes from Unity's own include, declared as Unity documents it."""
-
-ENTRY = """
-float4 main(float4 position : SV_Position) : SV_Target
-{
-    float2 xy = position.xy / (0.5 * SIZE) - 1.0;
-    xy /= max(length(xy), 1.0);
-    float3 color = unshade(float3(xy, sqrt(max(1.0 - dot(xy, xy), 0.0))));
-    return float4(SHOWN(UNSHADE_SHOWN(color)), 1.0);
-}
-"""
-
-
-def unity_properties(text: str) -> dict[str, tuple[str, list[float]]]:
-    """(type, value) of each property of a ShaderLab text."""
-    found = re.findall(r'^\s*(?:\[\w+[^]]*\] )?(_\w+) \("[^"]*", (\w+)[^=]*\) = \(?([^)\n{]*)\)?$', text, re.MULTILINE)
-    return {name: (kind, [float(part) for part in value.split(",")]) for name, kind, value in found}
-
-
-def as_unity_gives(kind: str, value: list[float], gamma: bool) -> str:
-    """A property as the shader sees it: Unity converts picked colours in projects with linear colour."""
-    if kind == "Color" and not gamma:
-        value = [*srgb_decode(torch.tensor(value[:3], dtype=torch.float64)).tolist(), 1.0]
-    return f"{value[0]:.9g}" if len(value) == 1 else f"float4({', '.join(f'{part:.9g}' for part in value)})"
 
 
 def test_unity_stages_by_glslang(glslang: str, tmp_path: Path) -> None:
@@ -242,70 +211,17 @@ def test_unity_stages_by_glslang(glslang: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.browser
 @pytest.mark.parametrize("gamma", [True, False])
-def test_hlsl_in_chromium(gamma: bool, glslang: str, browser: str, tmp_path: Path) -> None:
-    if not shutil.which("spirv-cross"):
-        pytest.skip("needs SPIRV-Cross (apt-get install spirv-cross)")
-    jobs = {}
-    for name, made in PROGRAMS.items():
-        given = [
-            f"static const {'float' if len(value) == 1 else 'float4'} {key} = {as_unity_gives(kind, value, gamma)};"
-            for key, (kind, value) in unity_properties(unity(made)).items()
-        ]
-        code = re.sub(r"CBUFFER_START.*?CBUFFER_END", "\n".join(given), hlsl(made), flags=re.DOTALL).partition("struct Varyings")[0]
-        shown = "#define UNITY_COLORSPACE_GAMMA\n#define SHOWN(c) (c)\n" if gamma else "#define SHOWN(c) encode_color(c)\n"
-        (tmp_path / "tree.hlsl").write_text(shown + code + ENTRY.replace("SIZE", str(SIZE)), encoding="utf-8")
-        compiled(["-D", "-S", "frag", "-e", "main", "-V", "--auto-map-bindings", "-o", "tree.spv", "tree.hlsl"], tmp_path)
-        command = ["spirv-cross", "tree.spv", "--es", "--version", "300"]
-        source = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=True).stdout
-        source = source.replace("precision mediump float;", "precision highp float;")
-        pictures = {}
-        for sampler in re.findall(r"uniform \w* *sampler2D (\w+);", source):
-            picture = next(item for item in made.pictures if sampler.endswith(f"sampler_{item.name}"))
-            pictures[sampler] = picture.raster
-        assert len(pictures) == len(made.pictures)
-        jobs[name] = Job(source, {}, pictures, flipped=True)
+def test_hlsl_in_chromium(gamma: bool, browser: str, tmp_path: Path) -> None:
+    jobs = {name: hlsl_job(made, tmp_path, SIZE, gamma) for name, made in PROGRAMS.items()}
     assert_near(shaders(browser, tmp_path, jobs, SIZE))
-
-
-THREE_PAGE = """<!doctype html><meta charset="utf-8"><script type="importmap">{"imports": {"three": "./three.js"}}</script>
-<script type="module">
-import * as THREE from "three";
-const found = {}, places = [], normals = [], index = [];
-const renderer = new THREE.WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
-renderer.setSize(SIZE, SIZE, false);
-const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, 0, 10);
-camera.position.z = 5;
-for (let k = 0; k < SIZE * SIZE; k++) {  // a vertex at every pixel's centre, so that normals there are not interpolated
-  const x = ((k % SIZE) + 0.5) / (SIZE / 2) - 1, y = 1 - (Math.floor(k / SIZE) + 0.5) / (SIZE / 2), r = Math.max(Math.hypot(x, y), 1);
-  places.push(x, y, 0);
-  normals.push(x / r, y / r, Math.sqrt(Math.max(1 - (x * x + y * y) / (r * r), 0)));
-  if (k % SIZE < SIZE - 1 && k < SIZE * (SIZE - 1)) index.push(k, k + SIZE, k + 1, k + 1, k + SIZE, k + SIZE + 1);
-}
-const geometry = new THREE.BufferGeometry();
-geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(places), 3));
-geometry.setAttribute("normal", new THREE.BufferAttribute(new Float32Array(normals), 3));
-geometry.setIndex(index);
-for (const name of NAMES) {
-  const { createMaterial, ready } = await import(`./${name}.js`);
-  const scene = new THREE.Scene();
-  scene.add(new THREE.Mesh(geometry, createMaterial()));
-  await ready;
-  renderer.render(scene, camera);
-  found[name] = renderer.domElement.toDataURL("image/png");
-}
-await fetch("found", { method: "POST", body: JSON.stringify(found) });
-</script>"""
 
 
 @pytest.mark.slow
 @pytest.mark.browser
 def test_three_in_chromium(browser: str, tmp_path: Path) -> None:
-    (tmp_path / "three.js").write_bytes(files("unshade.export").joinpath("three.module.min.js").read_bytes())
     for name in SOME:
         (tmp_path / f"{name}.js").write_text(module(PROGRAMS[name]), encoding="utf-8")
-    (tmp_path / "index.html").write_text(THREE_PAGE.replace("SIZE", str(SIZE)).replace("NAMES", json.dumps(SOME)), encoding="utf-8")
-    found = json.loads(posted_by(browser, tmp_path, "index.html"))
-    assert_near({name: decoded(base64.b64decode(url.partition(",")[2])) for name, url in found.items()})
+    assert_near(by_three(browser, tmp_path, SOME, SIZE))
 
 
 @pytest.mark.slow
@@ -329,67 +245,17 @@ def test_three_page_runs_from_the_disk(browser: str, tmp_path: Path) -> None:
     assert page(PROGRAMS["lit"]).count('"meaning"') == len(PROGRAMS["lit"].uniforms)
 
 
-WGSL_ENTRY = """
-@group(0) @binding(0) var<storage, read_write> found: array<vec4f>;
-@group(0) @binding(1) var<uniform> bound: Parameters;
-@compute @workgroup_size(8, 8) fn main(@builtin(global_invocation_id) id: vec3u) {
-    let place = (vec2f(id.xy) + 0.5) / (0.5 * SIZE) - 1.0;
-    let xy = vec2f(place.x, -place.y) / max(length(place), 1.0);
-    let n = vec3f(xy, sqrt(max(1.0 - dot(xy, xy), 0.0)));
-    let color = unshade(n, bound);
-    found[id.y * SIZEu + id.x] = vec4f(color, distance(color, unshade(n, unshade_tree)));
-}
-"""
-
-
 @pytest.mark.slow
 def test_wgsl_by_naga() -> None:
     """Compiled by naga and run by wgpu; the bound structure and the constant one agree."""
-    wgpu = pytest.importorskip("wgpu", reason="needs wgpu (pip install wgpu) and a Vulkan driver")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        adapters = wgpu.gpu.enumerate_adapters_sync()
-    if not adapters:
-        pytest.skip("needs a driver for wgpu (apt-get install mesa-vulkan-drivers)")
-    device = next((found for found in adapters if "Vulkan" in found.summary), adapters[0]).request_device_sync()
-    usage, pictures = wgpu.BufferUsage, {}
+    device, pictures = wgpu_or_skip(), {}
     for name, made in PROGRAMS.items():
-        code = device.create_shader_module(code=wgsl(made) + WGSL_ENTRY.replace("SIZE", str(SIZE)))
-        if name not in SOME and not name.startswith("leaf-"):
-            continue
-        pipeline = device.create_compute_pipeline(layout="auto", compute={"module": code, "entry_point": "main"})
-        *places, total = offsets(made)
-        data = np.zeros(max(total // 4, 4), np.float32)
-        for place, item in zip(places, made.uniforms, strict=True):
-            data[place // 4 : place // 4 + len(item.value)] = item.value
-        result = device.create_buffer(size=SIZE * SIZE * 16, usage=usage.STORAGE | usage.COPY_SRC)
-        bound = device.create_buffer_with_data(data=data, usage=usage.UNIFORM)
-        buffers = [
-            {"binding": k, "resource": {"buffer": buffer, "offset": 0, "size": buffer.size}} for k, buffer in enumerate([result, bound])
-        ]
-        encoder = device.create_command_encoder()
-        job = encoder.begin_compute_pass()
-        job.set_pipeline(pipeline)
-        job.set_bind_group(0, device.create_bind_group(layout=pipeline.get_bind_group_layout(0), entries=buffers))
-        if made.pictures:
-            wrapped = {"address_mode_u": "repeat", "address_mode_v": "repeat", "min_filter": "linear", "mag_filter": "linear"}
-            entries = [{"binding": 0, "resource": device.create_sampler(**wrapped)}]
-            for k, item in enumerate(made.pictures, 1):
-                height, width = item.raster.height, item.raster.width
-                texels = np.ones((height, width, 4), np.float16)
-                texels[..., :3] = item.raster.array().transpose(1, 2, 0)
-                kind = wgpu.TextureUsage.TEXTURE_BINDING | wgpu.TextureUsage.COPY_DST
-                texture = device.create_texture(size=(width, height, 1), format="rgba16float", usage=kind)
-                layout = {"bytes_per_row": width * 8, "rows_per_image": height}
-                device.queue.write_texture({"texture": texture}, texels.tobytes(), layout, (width, height, 1))
-                entries.append({"binding": k, "resource": texture.create_view()})
-            job.set_bind_group(1, device.create_bind_group(layout=pipeline.get_bind_group_layout(1), entries=entries))
-        job.dispatch_workgroups(SIZE // 8, SIZE // 8)
-        job.end()
-        device.queue.submit([encoder.finish()])
-        drawn = np.frombuffer(device.queue.read_buffer(result), np.float32).reshape(SIZE, SIZE, 4)
-        assert drawn[..., 3].max() < 1e-3, name
-        pictures[name] = drawn[..., :3].transpose(2, 0, 1)
+        if name in SOME or name.startswith("leaf-"):
+            drawn = by_wgpu(device, made, SIZE)
+            assert drawn[3].max() < 1e-3, name
+            pictures[name] = drawn[:3]
+        else:
+            wgsl_module(device, made, SIZE)
     assert_near(pictures)
 
 

@@ -18,11 +18,14 @@ from unshade.render import part, render, srgb_decode
 from unshade.sphere import normals_from_xy, sphere_grid
 from unshade.types import Image
 
+BLENDER_PADDING = 0.004
+"""Of the size: Blender looks a MatCap up at ``0.5 + 0.496 n.xy``, so that this share of the picture is left on each side."""
+
 BAND_PIXELS = 2**18
 """A large picture is rendered in bands of rows of about this many pixels; all at once it takes many times its size."""
 
 
-def padded(tree: Tree | Node, size: int, padding: int = 0) -> Image:
+def padded(tree: Tree | Node, size: int, padding: float = 0) -> Image:
     """(3, size, size) display-encoded picture of the sphere and what continues it.
 
     Raises UnshadeError where the padding leaves no sphere.
@@ -44,13 +47,14 @@ def write_exr(tree: Tree, path: Path, size: int = 512, padding: int = 0) -> None
     write_picture(path, padded(tree, size, padding), exposure=tree.exposure)
 
 
-def write_blender_matcap(tree: Tree, path: Path, size: int = 512, padding: int = 0) -> None:
+def write_blender_matcap(tree: Tree, path: Path, size: int = 512, padding: float | None = None) -> None:
     """An EXR with the layers ``diffuse`` and ``specular``, which Blender's MatCap adds in linear light.
 
     A tree screens its lights over its form instead. So ``specular`` is what the lights add to the light of the whole picture,
     ``decode(all) - decode(form)``, and the sum is the tree's picture; it is never negative, since no operator darkens where an
-    input brightens. Raises MissingExtraError.
+    input brightens. The padding is the one that Blender expects unless it is given. Raises MissingExtraError.
     """
+    padding = BLENDER_PADDING * size if padding is None else padding
     try:
         import OpenEXR
     except ImportError:
