@@ -12,7 +12,7 @@ import bpy
 def sphere() -> None:
     for thing in list(bpy.data.objects):
         bpy.data.objects.remove(thing)
-    bpy.ops.mesh.primitive_uv_sphere_add(segments=512, ring_count=256)
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=256, ring_count=128)
     bpy.ops.object.shade_smooth()
     camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     camera.data.type, camera.data.ortho_scale, camera.location = "ORTHO", 2.0, (0.0, 0.0, 4.0)

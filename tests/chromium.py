@@ -10,6 +10,7 @@ import io
 import json
 import os
 import queue
+import shutil
 import signal
 import subprocess
 import tempfile
@@ -19,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from unshade.nodes import Raster
@@ -78,6 +80,8 @@ vec3 unit_normal() {
 """
 """GLSL for the normal at a pixel of a square picture of the sphere."""
 
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
 OPTIONS = ("--headless", "--no-sandbox", "--disable-gpu-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
@@ -90,6 +94,15 @@ class Job:
     pictures: Mapping[str, Raster]
     flipped: bool = False
     """Rows of pictures run upwards."""
+
+
+def browser_or_skip() -> str:
+    """Path of a Chromium; skipped where there is none."""
+    for name in BROWSERS:
+        found = shutil.which(name)
+        if found:
+            return found
+    pytest.skip("needs Chromium (apt-get install chromium)")
 
 
 @contextlib.contextmanager

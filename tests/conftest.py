@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,8 +9,9 @@ import hypothesis
 import pytest
 import torch
 
+from chromium import browser_or_skip
+
 ROOT = Path(__file__).resolve().parent.parent
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 torch.set_num_threads(1)
 torch.use_deterministic_algorithms(True)
@@ -41,11 +41,7 @@ def generator() -> torch.Generator:
 @pytest.fixture(scope="session")
 def browser() -> str:
     """Path of a Chromium; the test is skipped where there is none."""
-    for name in BROWSERS:
-        found = shutil.which(name)
-        if found:
-            return found
-    pytest.skip("needs Chromium (apt-get install chromium)")
+    return browser_or_skip()
 
 
 @pytest.fixture(autouse=True)

@@ -8,12 +8,15 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import shutil
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from chromium import decoded, posted_by
 from unshade.nodes import Raster
@@ -90,7 +93,8 @@ func _ready() -> void:
             await RenderingServer.frame_post_draw
         var uniforms := RenderingServer.get_shader_parameter_list(shader.get_rid()).map(func(entry): return entry.name)
         var drawn := viewport.get_texture().get_image()
-        found[name] = {"uniforms": uniforms, "picture": Marshalls.raw_to_base64(drawn.save_png_to_buffer())}
+        var picture := Marshalls.raw_to_base64(drawn.save_png_to_buffer())
+        found[name] = {"uniforms": uniforms, "picture": picture, "version": Engine.get_version_info().string}
     JavaScriptBridge.eval("window.finish(%s)" % JSON.stringify(JSON.stringify(found)), true)
 """
 
@@ -118,10 +122,29 @@ def pack(files: Mapping[str, bytes]) -> bytes:
     return header + b"\0" * (base - len(header)) + content + directory
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """What Godot made of a shader."""
+
+    parameters: set[str]
+    picture: np.ndarray
+    """(3, size, size)."""
+    version: str
+
+
+def engine_or_skip() -> Path:
+    """The folder of the engine; skipped where none is named."""
+    named = os.environ.get("UNSHADE_GODOT_WEB")
+    if not named:
+        pytest.skip("needs UNSHADE_GODOT_WEB, the folder of a Godot 4 web export")
+    return Path(named)
+
+
 def godot_pictures(
-    browser: str, engine: Path, folder: Path, shaders: Mapping[str, str], pictures: Mapping[str, Mapping[str, Raster]], size: int
-) -> dict[str, tuple[set[str], np.ndarray]]:
-    """For each shader the parameters that Godot found and what it drew, (3, size, size). Raises AssertionError with Godot's words."""
+    browser: str, folder: Path, shaders: Mapping[str, str], pictures: Mapping[str, Mapping[str, Raster]], size: int
+) -> dict[str, Drawn]:
+    """What Godot makes of each shader and its pictures. Raises AssertionError with Godot's words."""
+    engine = engine_or_skip()
     for file in (*engine.glob("index*.js"), engine / "index.wasm"):
         shutil.copy(file, folder / file.name)
     script = SCRIPT.replace("{size}", str(size)).replace("    ", "\t")
@@ -135,4 +158,7 @@ def godot_pictures(
     (folder / "godot.html").write_text(PAGE.replace("JOBS", json.dumps(jobs).replace("</", "<\\/")), encoding="utf-8")
     answer = json.loads(posted_by(browser, folder, "godot.html", timeout=240.0))
     assert not answer["said"], answer["said"]
-    return {name: (set(entry["uniforms"]), decoded(base64.b64decode(entry["picture"]))) for name, entry in answer["found"].items()}
+    return {
+        name: Drawn(set(entry["uniforms"]), decoded(base64.b64decode(entry["picture"])), entry["version"])
+        for name, entry in answer["found"].items()
+    }

@@ -209,9 +209,13 @@ def read_layer(channels: dict[str, np.ndarray], name: str) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_blender_adds_the_layers(tmp_path: Path) -> None:
-    """Its Workbench shows the whole tree, not the form alone."""
+def test_blender_shows_the_matcaps(tmp_path: Path) -> None:
+    """Also that it adds the layers: the form alone would be far away."""
     blender_or_skip()
-    export(TREES["lit"], tmp_path / "matcap.exr", "blender-matcap", size=256)
-    shown = np.moveaxis(by_workbench(tmp_path, 128)["matcap"], 0, -1)
-    assert psnr(shown, rendered(TREES["lit"], 128)) >= 45.0
+    export(TREES["lit"], tmp_path / "layers.exr", "blender-matcap", size=256)
+    export(TREES["lit"], tmp_path / "light.exr", "exr", size=250, padding=1)
+    export(TREES["lit"], tmp_path / "plain.png", "png", size=250, padding=1)
+    shown = by_workbench(tmp_path, 128)
+    assert set(shown) == {"layers", "light", "plain"}
+    for name, picture in shown.items():
+        assert psnr(np.moveaxis(picture, 0, -1), rendered(TREES["lit"], 128)) >= 45.0, name

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import warnings
@@ -268,14 +267,11 @@ def godot_shows(color: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.browser
 def test_godot(browser: str, tmp_path: Path) -> None:
-    engine = os.environ.get("UNSHADE_GODOT_WEB")
-    if not engine:
-        pytest.skip("needs UNSHADE_GODOT_WEB, the folder of a Godot 4 web export")
     texts = {name: godot(PROGRAMS[name]) for name in SOME}
     rasters = {name: {item.name: item.raster for item in PROGRAMS[name].pictures} for name in SOME}
-    for name, (known, picture) in godot_pictures(browser, Path(engine), tmp_path, texts, rasters, SIZE).items():
-        assert {item.name for item in (*PROGRAMS[name].uniforms, *PROGRAMS[name].pictures)} <= known
-        assert psnr(picture, godot_shows(expected(TREES[name]))) >= NEAR, name
+    for name, drawn in godot_pictures(browser, tmp_path, texts, rasters, SIZE).items():
+        assert {item.name for item in (*PROGRAMS[name].uniforms, *PROGRAMS[name].pictures)} <= drawn.parameters
+        assert psnr(drawn.picture, godot_shows(expected(TREES[name]))) >= NEAR, name
 
 
 def test_normals_are_seen_along_the_ray() -> None:
