@@ -12,7 +12,8 @@ import torch
 from PIL import Image as PillowImage
 
 from unshade import drawing, labels
-from unshade.nodes import Leaf, Operator, Raster, Tree, leaf, mix, multiply, screen
+from unshade.artifacts import layer_name
+from unshade.nodes import Leaf, Node, Operator, Raster, Tree, leaf, mix, multiply, screen, walk
 from unshade.render import render, srgb_encode
 from unshade.sphere import sphere_normals
 
@@ -58,6 +59,19 @@ def test_a_mask_is_grey_and_never_encoded() -> None:
 def test_a_linear_tree_is_shown_encoded() -> None:
     albedo = drawing.layers(Tree(leaf("albedo", color=(0.2, 0.2, 0.2)), "linear"), 4)["albedo"]
     torch.testing.assert_close(albedo, srgb_encode(torch.full((3, 4, 4), 0.2)))
+
+
+def test_pictures_of_a_deep_tree_have_names_that_a_file_system_takes() -> None:
+    root: Node = leaf("albedo")
+    for _ in range(40):
+        root = screen(leaf("highlight"), root)
+    addresses = [address for address, _ in walk(root)]
+    names = [layer_name(address) for address in addresses]
+    assert max(map(len, addresses)) > 255
+    assert max(map(len, names)) < 140
+    assert len({name.lower() for name in names}) == len(names)
+    assert names[:3] == addresses[:3]
+    assert names[-1].endswith(addresses[-1][-40:])
 
 
 def test_a_deep_tree_is_drawn() -> None:

@@ -103,9 +103,10 @@ def test_a_full_frame_matcap_is_the_inscribed_disc_bit_for_bit(tmp_path: Path, w
 
 @pytest.mark.parametrize("color", [(0, 0, 0), (255, 255, 255), (200, 30, 90)])
 def test_one_colour_is_a_matcap(tmp_path: Path, color: tuple[int, int, int]) -> None:
-    sphere = read_sphere(save(tmp_path / "flat.png", np.full((40, 40, 3), color, dtype=np.uint8)), size=64)
-    assert (sphere.disc.cx, sphere.disc.r) == (20, 20)
-    assert float((sphere.image - torch.tensor(color).view(3, 1, 1) / 255).abs().max()) < 1e-6
+    for width in (40, 70):
+        sphere = read_sphere(save(tmp_path / "flat.png", np.full((40, width, 3), color, dtype=np.uint8)), size=64)
+        assert (sphere.disc.cx, sphere.disc.r) == (width / 2, 20)
+        assert float((sphere.image - torch.tensor(color).view(3, 1, 1) / 255).abs().max()) < 1e-6
 
 
 def test_the_disc_of_alpha_is_exact_to_a_fifth_of_a_pixel() -> None:
@@ -125,8 +126,6 @@ def no_sphere(kind: str) -> np.ndarray:
         return random.integers(0, 256, (100, 180, 3)).astype(np.uint8)
     if kind == "landscape":
         return (np.linspace(0, 1, 100)[:, None, None] * np.array([200, 120, 60]) + np.zeros((100, 170, 3))).astype(np.uint8)
-    if kind == "flat, not square":
-        return np.full((60, 100, 3), 90, dtype=np.uint8)
     page = Image.new("RGB", (160, 160) if kind == "text" else (220, 160), "white")
     draw = ImageDraw.Draw(page)
     if kind == "text":
@@ -137,7 +136,7 @@ def no_sphere(kind: str) -> np.ndarray:
     return np.asarray(page)
 
 
-@pytest.mark.parametrize("kind", ["noise", "wide noise", "landscape", "flat, not square", "text", "rectangle"])
+@pytest.mark.parametrize("kind", ["noise", "wide noise", "landscape", "text", "rectangle"])
 def test_a_picture_without_a_sphere_says_what_to_do(tmp_path: Path, kind: str) -> None:
     path = save(tmp_path / "nothing.png", no_sphere(kind))
     with pytest.raises(PictureError, match=r"no sphere found.*--disc cx,cy,r"):

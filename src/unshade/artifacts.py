@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -25,6 +26,9 @@ Figures: TypeAlias = "dict[str, Any]"
 
 DIFFERENCE_GAIN = 4.0
 """``difference.png`` shows the absolute difference this many times brighter."""
+
+LONGEST_NAME = 120
+"""Letters of an address that stand in a file's name; file systems take 255 at most, and Windows 260 for the whole path."""
 
 BAND_PIXELS = 1 << 20
 """Pixels that `write_render` shades at once."""
@@ -88,7 +92,7 @@ def _write_pictures(result: Result, sphere: SphereImage, staging: Path) -> None:
     write_picture(staging / "difference.png", difference.clamp(max=1.0))
     (staging / "layers").mkdir()
     for address, layer in drawing.layers(result.tree, size).items():
-        write_picture(staging / "layers" / f"{address}.png", layer, alpha)
+        write_picture(staging / "layers" / f"{layer_name(address)}.png", layer, alpha)
     (staging / "family").mkdir()
     for member in result.family.members:
         write_picture(staging / "family" / f"{member.values:04d}.png", render(member.tree, normals), alpha)
@@ -96,6 +100,13 @@ def _write_pictures(result: Result, sphere: SphereImage, staging: Path) -> None:
         (staging / "alternatives").mkdir()
     for number, member in enumerate(result.family.alternatives, start=1):
         write_picture(staging / "alternatives" / f"{number}.png", render(member.tree, normals), alpha)
+
+
+def layer_name(address: str) -> str:
+    """What a node's picture is called: its address, or a digest and the end of one that no file system would take."""
+    if len(address) <= LONGEST_NAME:
+        return address
+    return f"{hashlib.sha256(address.encode()).hexdigest()[:8]}...{address[-LONGEST_NAME:]}"
 
 
 def disc_alpha(size: int) -> torch.Tensor:

@@ -184,9 +184,11 @@ def tree_svg(
     root = _plan(tree.root, fold)
     width, height = _place(root)
     area = f'width="{width:.0f}" height="{height:.0f}"'
+    # A page can make it smaller only by how much it knows its own width.
+    known = "" if standalone else f' style="--width:{width:.0f}px"'
     about = f'viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(title)}"'
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" class="shade-tree" {area} {about}>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="shade-tree" {area}{known} {about}>',
         f"<style>{STYLE}</style><defs>" if standalone else "<defs>",
         f'<clipPath id="{prefix}-disc" clipPathUnits="userSpaceOnUse"><circle cx="0.5" cy="0.5" r="0.5"/></clipPath>',
         *_symbols(tree, places, prefix, thumbnail, encoding, quality),

@@ -23,6 +23,9 @@ MIN_COVERAGE = 0.45
 MIN_RADIUS = 5.0
 """Smallest sphere that is looked for, in pixels."""
 
+ONE_COLOR = 0.5 / 255.0
+"""A picture that varies less than this, root mean square, is all one colour: wherever its sphere is, it looks the same."""
+
 SNAP = 0.015
 """A circle this close to the inscribed disc of a square picture, as a share of its radius, is that disc."""
 
@@ -93,6 +96,8 @@ def find_disc(rgb: Array) -> Disc | None:
         score = smoothness(rgb)
         if score > 0.0:
             return inscribed_disc(width, height, score)
+    if float(rgb.reshape(-1, 3).std(axis=0).max()) < ONE_COLOR:
+        return inscribed_disc(width, height, 0.0)
     return None
 
 

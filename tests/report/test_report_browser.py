@@ -335,3 +335,19 @@ def test_the_file_can_be_saved(chromium: Browser, report: Path, tmp_path: Path) 
         time.sleep(0.05)
     assert len(loads_family(saved.read_text()).members) == 10
     assert chromium.complaints() == []
+
+
+@pytest.mark.browser
+def test_a_tree_of_the_usual_size_is_seen_whole(chromium: Browser, made: SimpleNamespace, tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text(made.page(made.outcome([made.grown(11)], 0)), encoding="utf-8")
+    chromium.call("Emulation.setDeviceMetricsOverride", width=1280, height=800, deviceScaleFactor=1, mobile=False)
+    try:
+        chromium.visit(tmp_path / "report.html")
+        frame, drawn = chromium.ask(
+            "['.drawn', '.drawn .shade-tree'].map(s => document.querySelector(s).getBoundingClientRect()).map(b => [b.left, b.right])"
+        )
+        assert 0 <= frame[0] <= drawn[0] < drawn[1] <= frame[1] <= 1280
+        assert drawn[1] - drawn[0] > 1100
+        assert chromium.ask("document.documentElement.scrollWidth") <= 1280
+    finally:
+        chromium.call("Emulation.clearDeviceMetricsOverride")
