@@ -66,6 +66,7 @@ docs: $(VENV)/.dev
 	@$(PY) scripts/photographs_pictures.py
 	@$(PY) scripts/cli_reference.py
 	@$(PY) scripts/export_page.py
+	@$(PY) scripts/export_gallery.py
 	@$(PY) scripts/readme_picture.py
 
 clean:

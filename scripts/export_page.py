@@ -29,6 +29,8 @@ from unshade.export import export
 export(tree, "ball.svg", "svg")
 ```
 
+[export-gallery.md](export-gallery.md) shows one MatCap in every target, as real programs draw it.
+
 Every target is a translation of the one renderer, and is tested on the same fixture trees (`tests/export_trees.py`: every leaf,
 operator, nesting and mask) against it. What a target cannot hold is said by `export` as an `ExportWarning` and by the command on
 standard error, with the nodes it happens to and what becomes of them. A target is *experimental* until a program of its own world has
@@ -70,8 +72,8 @@ MATCAPS = """
 `png` and `exr` fill the square: past the silhouette every pixel has the colour of the silhouette's nearest point, and `--padding`
 leaves room for it on all sides. Blender adds the `diffuse` and `specular` layers of a MatCap in linear light, where a tree screens
 encoded values. So `blender-matcap` stores as `specular` what the lights add to the light of the whole, `decode(all) - decode(form)`:
-the sum is the tree's picture, and without it the form is left.
-Blender 5.0 reads the layers; that they add up is tested by reading them here.
+the sum is the tree's picture, and without it the form is left. Blender looks a MatCap up at `0.5 + 0.496 n.xy`, so `blender-matcap` leaves
+0.4 % of the size on each side unless `--padding` is given; a `png` or `exr` for Blender wants the same (`--size 500 --padding 2`).
 """
 
 

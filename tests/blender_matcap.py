@@ -40,7 +40,6 @@ def main() -> None:
         shading.studio_light = light.name
         scene.render.filepath = str(folder / "shown" / f"{file.stem}.png")
         bpy.ops.render.render(write_still=True)
-    print("Blender", bpy.app.version_string)
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ def blender_or_skip() -> list[str]:
     """How to run a script in Blender; skipped where there is none."""
     try:
         return command()
-    except MissingExtraError as error:
-        pytest.skip(str(error))
+    except MissingExtraError:
+        pytest.skip("needs Blender (on the path, or UNSHADE_BLENDER: also a Python with bpy)")
 
 
 def run_in_blender(script: Path, *arguments: object, within: Sequence[str] = ()) -> str:
@@ -34,6 +34,11 @@ def run_in_blender(script: Path, *arguments: object, within: Sequence[str] = ())
     done = subprocess.run(whole, capture_output=True, text=True, check=False)
     assert done.returncode == 0, (done.stderr or done.stdout)[-2000:]
     return done.stdout
+
+
+def blender_version() -> str:
+    """``Blender 5.0.1``."""
+    return run_in_blender(HERE / "blender_version.py").partition("THIS IS ")[2].splitlines()[0]
 
 
 def by_cycles(folder: Path, size: int) -> dict[str, np.ndarray]:

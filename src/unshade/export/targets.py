@@ -43,7 +43,13 @@ OPTIONS = {
     for option in (
         Option("size", "Width and height in pixels.", "integer", 1, 8192),
         Option("bits", "Bits a channel.", "word", words=("8", "16")),
-        Option("padding", "Pixels between the silhouette and the edge of the picture.", "integer", 0, 4096),
+        Option(
+            "padding",
+            "Pixels between the silhouette and the edge of the picture; blender-matcap takes Blender's own unless given.",
+            "integer",
+            0,
+            4096,
+        ),
         Option("shape", "An SVG with a closed path to be shaded in the sphere's place.", "file"),
         Option("region", "The id of the path, where the SVG has several.", "text"),
     )
@@ -125,7 +131,7 @@ TARGETS = {
             "a MatCap picture, continued past the silhouette",
             "matcap.write_png",
             (PICTURE,),
-            "Pillow",
+            "Pillow and Blender 5.0",
             ("size", "bits", "padding"),
         ),
         Target(
@@ -182,7 +188,7 @@ TARGETS = {
             "a MatCap in linear light, continued past the silhouette",
             "matcap.write_exr",
             (PICTURE,),
-            "OpenEXR",
+            "OpenEXR and Blender 5.0",
             ("size", "padding"),
             needs="OpenEXR",
         ),
