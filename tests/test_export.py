@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from unshade import cli
 from unshade.blend import BLENDS
 from unshade.errors import OutputError, UnshadeError
 from unshade.export import OPTIONS, TARGETS, ExportWarning, degradations, export, target_of
+from unshade.export import __all__ as public
 from unshade.nodes import KINDS
 from unshade.serde import dump
 
@@ -113,6 +115,11 @@ def test_the_list_says_every_target(capsys: pytest.CaptureFixture[str]) -> None:
     for target in TARGETS.values():
         assert f"\n{target.name} " in f"\n{shown}"
         assert "experimental" in shown or not target.experimental
+
+
+@pytest.mark.parametrize("name", public)
+def test_public_name_is_documented(name: str) -> None:
+    assert re.search(rf"`(unshade\.export\.)?{name}\b", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"))
 
 
 def test_the_page_is_fresh() -> None:
