@@ -89,6 +89,23 @@ def test_every_leaf_broadcasts_normals_and_parameters(name: str) -> None:
         assert torch.allclose(together[0], alone, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("device", ["meta", "cuda"])
+def test_every_leaf_follows_the_device_of_the_normals(device: str, name: str) -> None:
+    """A formula with a number of its own on the CPU fails on ``meta``, which needs no hardware; CUDA shows the same picture."""
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    kind = KINDS[name]
+    parameters = [_numbers(parameter, k) for k, parameter in enumerate(kind.parameters)]
+    parameters = [numbers[None] if kind.repeats else numbers for numbers in parameters]
+    for normals in (NORMALS, NORMALS.float()):
+        shaded = kind.formula(normals.to(device), *(numbers.to(device, normals.dtype) for numbers in parameters))
+        assert (shaded.device.type, shaded.dtype, shaded.shape) == (device, normals.dtype, (kind.channels, 12, 12))
+        if device == "cuda":
+            expected = kind.formula(normals, *(numbers.to(normals.dtype) for numbers in parameters))
+            torch.testing.assert_close(shaded.cpu(), expected, rtol=0, atol=1e-5)
+
+
 @given(nodes(max_leaves=4))
 @settings(max_examples=15)
 def test_one_set_of_parameters_for_each_picture(node: Node) -> None:
