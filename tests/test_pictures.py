@@ -523,6 +523,17 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, name: str) -> None:
     assert "\n" not in str(raised.value) and name in str(raised.value)
 
 
+def test_a_pillow_that_knows_no_avif_still_tells_what_is_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if "Avif" in name else find(name))
+    monkeypatch.delitem(Image.OPEN, "AVIF", raising=False)
+    monkeypatch.setattr(Image, "init", lambda: True)
+    (tmp_path / "letter.png").write_bytes(b"dear reader, " * 20)
+    with pytest.raises(PictureError, match="expected a picture"):
+        read_picture(tmp_path / "letter.png")
+    assert read_picture(save(tmp_path / "matcap.png", as_bytes(matcap()))).width
+
+
 @needs_exr
 def test_a_truncated_exr_prints_nothing_of_its_own(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     write_picture(tmp_path / "whole.exr", torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0)))

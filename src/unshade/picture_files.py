@@ -6,6 +6,7 @@ primaries say otherwise.
 
 from __future__ import annotations
 
+import importlib.util
 import struct
 import sys
 import warnings
@@ -34,7 +35,7 @@ MAX_PIXELS = 80_000_000
 SUFFIXES = frozenset(".png .jpg .jpeg .webp .tif .tiff .exr .hdr .pic .bmp .gif .ppm .pgm .tga .avif".split())
 """What counts as a picture in a folder. A file named outright is read whatever its name."""
 
-_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "AVIF")
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA")
 _BROKEN = (OSError, SyntaxError, ValueError, EOFError, KeyError, TypeError, OverflowError, struct.error, zlib.error)
 """What Pillow's readers raise for damaged files."""
 
@@ -116,7 +117,7 @@ def _read_display(path: Path, start: bytes, colors: bool) -> Picture:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", PILImage.DecompressionBombWarning)
-            with PILImage.open(path, formats=_FORMATS) as image:
+            with PILImage.open(path, formats=_formats()) as image:
                 check_size(path, *image.size)
                 return _decode(path, image, colors)
     except UnidentifiedImageError:
@@ -127,6 +128,11 @@ def _read_display(path: Path, start: bytes, colors: bool) -> Picture:
         raise PictureError(f"{path}: larger than {MAX_PIXELS // 1_000_000} million pixels; scale it down first") from None
     except _BROKEN as error:
         raise PictureError(f"{path}: damaged or truncated {_first_line(error)}") from None
+
+
+def _formats() -> tuple[str, ...]:
+    """What is asked of Pillow, which has known AVIF since its version 11.3."""
+    return (*_FORMATS, "AVIF") if importlib.util.find_spec("PIL.AvifImagePlugin") else _FORMATS
 
 
 def _first_line(error: Exception) -> str:
