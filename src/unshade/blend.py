@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
+from operator import mul
 
 from torch import Tensor
 
@@ -26,15 +28,11 @@ def mix(left: Tensor, right: Tensor, mask: Tensor) -> Tensor:
 
 def _products_of_others(factors: Sequence[Tensor]) -> list[Tensor | float]:
     """For each factor the product of all the others, without dividing."""
-    before: list[Tensor | float] = [1.0]
-    for factor in factors[:-1]:
-        before.append(before[-1] * factor)
-    after: Tensor | float = 1.0
-    products: list[Tensor | float] = []
-    for head, factor in zip(reversed(before), reversed(factors), strict=True):
-        products.append(head * after)
-        after = after * factor
-    return products[::-1]
+    if len(factors) == 1:
+        return [1.0]
+    before = list(accumulate(factors[:-1], mul))
+    after = list(accumulate(factors[:0:-1], mul))[::-1]
+    return [after[0], *map(mul, before[:-1], after[1:]), before[-1]]
 
 
 def multiply_gains(*layers: Tensor) -> list[Tensor | float]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from unshade.atoms import Dictionary
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
@@ -35,6 +36,7 @@ class Effort:
     beam: int = 2
     """Plain trees of every form that are kept while they grow; 0 leaves the plain search out."""
     beam_moves: int = 5
+    """Ways in which each of them may grow on."""
     trials: int = 4
     """Moves that are tried by a short fit at each growth."""
     trial_steps: int = 4
@@ -59,7 +61,7 @@ class Candidate:
     root: Node
     error: float
 
-    @property
+    @cached_property
     def values(self) -> int:
         """Stored values."""
         return count_values(self.root)

@@ -241,7 +241,7 @@ class Proposer:
         grown = replace(root, place.address, node)
         cost = count_values(grown) - self.size
         after = max(self.error - gain, 1e-3 * self.error, 1e-12)
-        relative = float(torch.tensor(self.error / after).log()) / max(cost, 1)
+        relative = math.log(max(self.error, 1e-12) / after) / max(cost, 1)
         return Move(grown, family, place.address, gain, cost, relative)
 
 

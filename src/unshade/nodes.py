@@ -292,7 +292,7 @@ def _clean(kind: Kind, parameter: Parameter, value: object) -> Value:
             raise TreeError(f"{where}: expected {parameter.channels} channels, got {value.channels}")
         return value
     try:
-        numbers = tuple(float(number) for number in np.ravel(np.asarray(value, dtype=np.float64)))
+        numbers = _numbers(value)
     except (TypeError, ValueError):
         raise TreeError(f"{where}: expected {parameter.size} numbers, got {value!r}") from None
     if not numbers or len(numbers) % parameter.size or (len(numbers) != parameter.size and not kind.repeats):
@@ -304,6 +304,13 @@ def _clean(kind: Kind, parameter: Parameter, value: object) -> Value:
     if min(numbers) < parameter.low or max(numbers) > parameter.high:
         raise TreeError(f"{where}: must be in [{parameter.low:g}, {parameter.high:g}], got {', '.join(f'{n:g}' for n in numbers)}")
     return numbers
+
+
+def _numbers(value: object) -> tuple[float, ...]:
+    """Plain numbers, at once where they are floats already, as those of a fit are."""
+    if isinstance(value, tuple | list) and all(type(number) is float for number in value):
+        return tuple(value)
+    return tuple(float(number) for number in np.ravel(np.asarray(value, dtype=np.float64)))
 
 
 def _unit(where: str, vector: tuple[float, ...]) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ and `Layout.logarithmic` says which numbers an optimiser should see on a logarit
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import torch
 
@@ -32,6 +32,11 @@ class Layout:
     free: torch.Tensor
     """(P,) bool, false for an amplitude that the tint beside it carries."""
 
+    @cached_property
+    def is_direction(self) -> torch.Tensor:
+        """(P,) bool, true for the numbers of directions."""
+        return torch.tensor([kind == "direction" for kind in self.types], dtype=torch.bool)
+
     @property
     def size(self) -> int:
         """Numbers in the vector."""
@@ -52,8 +57,7 @@ class Layout:
     def unpack(self, root: Node, vector: Params) -> Node:
         """The tree with the numbers of a (P,) vector, brought into range."""
         vector = vector.detach().to("cpu", torch.float64)
-        is_direction = torch.tensor([kind == "direction" for kind in self.types], dtype=torch.bool)
-        vector = torch.where(is_direction, vector, vector.clamp(self.lower, self.upper))
+        vector = torch.where(self.is_direction, vector, vector.clamp(self.lower, self.upper))
         numbers = vector.tolist()
         found = iter(self.slots)
 

@@ -35,8 +35,14 @@ HOPELESS = 4.0
 UNLIKE = 2.5e-4
 """A picture that was not drawn shows itself while the plain trees' error is over this one."""
 
+LAGGING = 1.3
+"""No drawn picture is twice in turn explained this many times worse by plain words than by all words in trees as large."""
+
 LEAST_DESCENT = 0.05
 """Fall of log(error) a value, over two leaves, of plain trees on the way to a drawn picture; photographs give less."""
+
+MOST_DETOURS = 3
+"""Leaves that are taken from a plain tree whose error stays where it was: its edges will not fall into place either."""
 
 TWINS = 0.02
 """Two trees of one form and size whose errors differ by less than this share are taken for one."""
@@ -67,7 +73,7 @@ class DrawnSearch(Growth):
             best, stale = (leader, 0) if self._drawn(leader) < self._drawn(best) else (best, stale + 1)
             yield "plain", best
             leaders.append(leader)
-            if best.error > UNLIKE and leader.values >= 16 and (self._is_behind(leader, best, curve) or _is_stuck(leaders)):
+            if leader.values >= 16 and self._is_photograph(leaders, best, curve):
                 return None
         if best.error > UNLIKE:
             return None
@@ -91,19 +97,32 @@ class DrawnSearch(Growth):
         return sharp
 
     def _settling(self, sharp: Candidate, thorough: bool) -> Iterator[Candidate]:
-        """Changes of one leaf, as long as they are better."""
+        """Changes of one leaf, as long as they are better and not only make a tree that is not the picture's smaller."""
+        detours = 0
         for step in range(self.effort.settle_steps):
             if sharp.error > (SETTLED if step < 5 else 0.15 * SETTLED):
                 return
             better = self._settle(sharp, thorough)
             if better is None or better.error > max(DRAWN, 1.3 * sharp.error):
                 return
+            detours += better.error > max(DRAWN, 0.9 * sharp.error)
             sharp = better
             yield sharp
+            if detours == MOST_DETOURS:
+                return
 
-    def _is_behind(self, leader: Candidate, best: Candidate, curve: list[Candidate]) -> bool:
-        rivals = [candidate.error for candidate in curve if candidate.values <= leader.values]
-        return min(leader.error, best.error) > (1.8 if leader.values < 26 else 1.4) * min(rivals, default=math.inf)
+    def _is_photograph(self, leaders: list[Candidate], best: Candidate, curve: list[Candidate]) -> bool:
+        """Do the plain words fall behind all words, twice in turn or by far, or do they explain too little?"""
+
+        def lag(leader: Candidate) -> float:
+            return leader.error / min((rival.error for rival in curve if rival.values <= leader.values), default=math.inf)
+
+        if len(leaders) > 1 and all(leader.values >= 12 and lag(leader) > LAGGING for leader in leaders[-2:]):
+            return True
+        if best.error <= UNLIKE:
+            return False
+        now = leaders[-1]
+        return min(1.0, best.error / now.error) * lag(now) > (1.8 if now.values < 26 else 1.4) or _is_stuck(leaders)
 
     def prune(self, current: Candidate) -> Candidate:
         """Any tree that reproduces a drawn picture, without what is only there to mend a few pixels."""
@@ -142,15 +161,17 @@ class DrawnSearch(Growth):
             if count_values(root) <= self.effort.max_values:
                 quick = fit_pixels(points, root, steps=4, softest=FINE_SOFTNESS, limits=limits)
                 options.append(Candidate(quick.root, quick.error))
-        options.sort(key=settled)
+        options = sorted((option for option in options if option.error < 2.0 * start + 1e-5), key=settled)
         smaller = [option for option in options if option.values < current.values and option.error < 1.5 * start + 1e-5]
         options = smaller[:6] + [option for option in options if option not in smaller][:6]
-        best, bar = None, settled(current) - 2e-3
+        best, bar, worse = None, settled(current) - 2e-3, 0
         for option in options:
             fitted = sharpen(self.samples.fine, option.root, steps=12, limits=limits)
             found = Candidate(fitted.root, fitted.error)
             if settled(found) < bar:
-                best, bar = found, settled(found)
+                best, bar, worse = found, settled(found), 0
+            elif best is not None and (worse := worse + 1) == 2:
+                break
         return best
 
     def _drawn(self, candidate: Candidate) -> float:

@@ -59,9 +59,9 @@ def minimise(
             held = ((numbers <= model.low) & (gradient > 0)) | ((numbers >= model.high) & (gradient < 0))
             diagonal = hessian.diagonal().clamp(min=1e-9)
             dead = held | (hessian.diagonal() < 1e-14)
-            hessian[dead] = 0.0
-            hessian[:, dead] = 0.0
-            gradient = torch.where(dead, torch.zeros_like(gradient), gradient)
+            alive = (~dead).double()
+            hessian *= alive[:, None] * alive
+            gradient *= alive
         damped = hessian + torch.diag(diagonal * damping + 1e-10)
         factor, info = torch.linalg.cholesky_ex(damped)
         if int(info) != 0:

@@ -75,6 +75,7 @@ class Model:
         self.root, self.pixels = root, pixels
         self.layout = Layout.of(root)
         self.normals = pixels.normals[:, None, :]
+        self._last_tangents: tuple[torch.Tensor, torch.Tensor] | None = None
         self.grazing = (1.0 - pixels.normals[2]).clamp(1e-6, 1.0)
         self.leaves: list[Leaf] = []
         self.addresses: list[str] = []
@@ -135,10 +136,11 @@ class Model:
         self.number = torch.tensor([number for number, _ in flat], dtype=torch.long)
         self.plain = torch.tensor([tangent < 0 for _, tangent in flat], dtype=torch.bool)
         self.log = layout.logarithmic[self.number] & self.plain
-        self.linear = self.plain & ~self.log
+        self.plain_rows, self.log_rows = _rows(self.plain), _rows(self.log)
+        self.linear_rows = _rows(self.plain & ~self.log)
         self.directions = self.number[torch.tensor([tangent == 0 for _, tangent in flat], dtype=torch.bool)]
         self.spread = self.directions[:, None] + torch.arange(3)
-        self.tangential = torch.tensor([row for row, (_, tangent) in enumerate(flat) if tangent >= 0], dtype=torch.long)
+        self.tangential = _rows(~self.plain)
         names = [layout.names[number].rsplit(".", 1)[-1] for number, _ in flat]
         low = torch.tensor([limits.get(name, (-math.inf, math.inf))[0] for name in names], dtype=torch.float64)
         high = torch.tensor([limits.get(name, (-math.inf, math.inf))[1] for name in names], dtype=torch.float64)
@@ -239,7 +241,15 @@ class Model:
         return jacobian
 
     def tangents(self, vector: torch.Tensor) -> torch.Tensor:
-        """Two unit vectors across the direction that starts at each number of the vector, (P, 2, 3); zero elsewhere."""
+        """Two unit vectors across the direction that starts at each number of the vector, (P, 2, 3); zero elsewhere.
+
+        A fit asks twice for each vector, for its Jacobian and for the step from it.
+        """
+        if self._last_tangents is None or self._last_tangents[0] is not vector:
+            self._last_tangents = vector, self._tangents(vector)
+        return self._last_tangents[1]
+
+    def _tangents(self, vector: torch.Tensor) -> torch.Tensor:
         basis = torch.zeros(vector.shape[0], 2, 3, dtype=vector.dtype)
         if len(self.directions):
             direction = F.normalize(vector[self.spread], dim=-1)
@@ -305,10 +315,10 @@ class Model:
     def move(self, vector: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """The vector after a step in the free coordinates, inside its bounds."""
         moved = vector.clone()
-        moved[self.number[self.linear]] += step[self.linear]
-        moved[self.number[self.log]] *= step[self.log].clamp(-1.5, 1.5).exp()
-        kept = self.number[self.plain]
-        moved[kept] = moved[kept].clamp(self.low[self.plain], self.high[self.plain])
+        moved[self.number[self.linear_rows]] += step[self.linear_rows]
+        moved[self.number[self.log_rows]] *= step[self.log_rows].clamp(-1.5, 1.5).exp()
+        kept = self.number[self.plain_rows]
+        moved[kept] = moved[kept].clamp(self.low[self.plain_rows], self.high[self.plain_rows])
         if len(self.directions):
             offset = (step[self.tangential].view(-1, 2, 1) * self.tangents(vector)[self.directions]).sum(1)
             moved[self.spread] = F.normalize(vector[self.spread] + offset, dim=-1)
@@ -317,3 +327,8 @@ class Model:
     def scale(self, vector: torch.Tensor) -> torch.Tensor:
         """d number / d coordinate where it is not 1: the number itself for logarithmic ones, (F,)."""
         return torch.where(self.log, vector[self.number], torch.ones_like(vector[self.number]))
+
+
+def _rows(chosen: torch.Tensor) -> torch.Tensor:
+    """The numbers of the true entries of (F,) bool."""
+    return chosen.nonzero()[:, 0]
