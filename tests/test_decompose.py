@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from unshade.decompose import PRESETS, Decomposition, Result, Step, decompose
+from unshade.decompose import PRESETS, Decomposition, Result, Step, decompose, fit
 from unshade.errors import PictureError, TreeError
 from unshade.grammar import same_structure, sample, structure_key, validate
 from unshade.metrics import psnr
-from unshade.nodes import KINDS, Node, Tree, leaf, mix, multiply, screen
+from unshade.nodes import KINDS, Leaf, Node, Tree, leaf, mix, multiply, screen
 from unshade.picture_output import write_picture
 from unshade.pictures import SphereImage, read_sphere
 from unshade.render import render
@@ -104,6 +104,20 @@ def test_a_sampled_tree_is_recovered(style: str, seed: int, least: float) -> Non
     assert result.psnr >= least
     assert same_structure(result.tree, tree), structure_key(result.tree)
     assert result.tree.values <= tree.values
+
+
+def test_a_bare_structure_is_fitted_to_all_lights_of_the_picture(lacquer: SphereImage) -> None:
+    form = multiply(leaf("albedo"), leaf("diffuse"))
+    tree = Tree(screen(form, leaf("highlight"), leaf("highlight"), leaf("highlight", name="kept", direction=(0.0, -1.0, 0.2))))
+    found = fit(lacquer, tree, locked=["kept"], anew=True)
+    assert found.psnr > fit(lacquer, tree, locked=["kept"]).psnr + 3.0
+    assert same_structure(found.tree, tree)
+    assert found.tree.find("kept") == tree.find("kept")
+    first, second = (found.tree.find(f"screen.{k}") for k in (1, 2))
+    assert first != second
+    assert isinstance(first, Leaf) and isinstance(second, Leaf)
+    assert min(first["amplitude"][0], second["amplitude"][0]) > 0.05
+    assert fit(lacquer, tree, locked=["kept"], anew=True).tree == found.tree
 
 
 def test_one_colour_is_one_albedo() -> None:

@@ -243,13 +243,13 @@ def _decompose_picture(job: Job, on_step: Callable[[Step], None] | None) -> Reco
     return _written(job, decomposition.result(), sphere, begin)
 
 
-def fit_picture(job: Job, tree: Tree, locked: Sequence[str]) -> Record:
-    """Read a picture, fit the parameters of a given tree to it, and write the result. Raises UnshadeError."""
+def fit_picture(job: Job, tree: Tree, locked: Sequence[str], anew: bool = False) -> Record:
+    """Read a picture, fit the parameters of a given tree to it (see `decompose.fit`), and write the result. Raises UnshadeError."""
     limit_threads()
     begin, sphere = time.perf_counter(), _read(job)
     from unshade.decompose import fit
 
-    return _written(job, fit(sphere, tree, locked=locked, seed=job.settings.seed), sphere, begin)
+    return _written(job, fit(sphere, tree, locked=locked, seed=job.settings.seed, anew=anew), sphere, begin)
 
 
 def _read(job: Job) -> SphereImage:

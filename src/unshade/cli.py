@@ -237,7 +237,7 @@ def _decomposed(jobs: Sequence[batch.Job], workers: int, messages: Messages) -> 
 
 @cli.command()
 @click.argument("image", type=click.Path(path_type=Path), metavar="IMAGE")
-@click.option("--structure", metavar="TEXT", help="The tree's text; its values are only where the fit starts.")
+@click.option("--structure", metavar="TEXT", help="The tree's text; its values are one of several starts of the fit.")
 @click.option("--from", "source", metavar="TREE", help="A tree to start from.")
 @click.option("--lock", multiple=True, metavar="ADDRESS", help="A node that keeps its values; may be repeated.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Where the result goes.")
@@ -269,7 +269,7 @@ def fit(
     settings, folder = _settings(output, options)
     log = batch.Log(folder)
     job = batch.Job(image, folder / batch.assign_folders([image], log)[0] if folder else None, settings)
-    record = batch.fit_picture(job, tree, lock)
+    record = batch.fit_picture(job, tree, lock, anew=structure is not None)
     log.add(job, record, fingerprint={"fit": structure or source})
     _tell(record, Messages(quiet))
     if as_json:

@@ -25,6 +25,7 @@ from unshade.pictures import SphereImage, read_sphere, sphere_from_array
 from unshade.render import render, srgb_decode
 from unshade.search import Search
 from unshade.sphere import sphere_normals
+from unshade.starts import read_off
 
 if TYPE_CHECKING:
     from unshade.learned import Hybrid, Learned, SecondStage, Settings
@@ -215,9 +216,18 @@ def decompose(
     return Decomposition(_without_gradients(_by_size(sphere, chosen, seed, alternatives, main)), sphere, seed, preset)
 
 
-def fit(image: SphereImage | torch.Tensor | Any | str | Path, tree: Tree, *, locked: Collection[str] = (), seed: int = 0) -> Result:
+def fit(
+    image: SphereImage | torch.Tensor | Any | str | Path, tree: Tree, *, locked: Collection[str] = (), seed: int = 0, anew: bool = False
+) -> Result:
     """Fit only the parameters of a tree to a picture; the structure stays, and so do ``locked`` addresses or names.
 
+    Args:
+        image: as `decompose` takes it.
+        tree: its numbers are where the fit starts.
+        locked: addresses, ``ADDRESS.parameter``, or names that keep their numbers.
+        seed: of everything drawn at random.
+        anew: for a structure whose numbers mean nothing: start also from numbers that are read off the picture. Without
+            it each light stays near where it is.
     Raises:
         PictureError: the picture cannot be used. AddressError: a locked address does not exist.
     """
@@ -225,7 +235,8 @@ def fit(image: SphereImage | torch.Tensor | Any | str | Path, tree: Tree, *, loc
     held = {_locked_address(tree.root, where) for where in locked}
     target = srgb_decode(sphere.image) if tree.blend_space == "linear" else sphere.image
     with _one_thread():
-        fitted = fit_least_squares(target, sphere.valid, tree.root, seed=seed, locked=held)
+        start = read_off(target, sphere.valid, tree.root, seed=seed, locked=held) if anew else tree.root
+        fitted = fit_least_squares(target, sphere.valid, start, seed=seed, locked=held)
     trees = [dataclasses.replace(tree, root=root, exposure=sphere.exposure) for root in (fitted.root, tree.root)]
     member = max((Member(found, _psnr(sphere, found)) for found in trees), key=lambda found: found.psnr)
     return Result(member.tree, Family((member,), 0), member.psnr, seed, "fit")
