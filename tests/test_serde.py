@@ -7,6 +7,7 @@ import io
 import json
 import os
 import struct
+import subprocess
 import sys
 import zlib
 from pathlib import Path
@@ -559,3 +560,35 @@ def test_kinds_from_outside_are_read_and_written(monkeypatch: pytest.MonkeyPatch
 def test_loading_keeps_leaf_values_as_floats() -> None:
     tree = loads(document({"kind": "highlight", "parameters": {"direction": [0, 0, 1], "sharpness": 40, "amplitude": 1}}))
     assert isinstance(tree.root, Leaf) and all(type(number) is float for value in tree.root.values for number in value)
+
+
+def test_the_command_line_knows_the_kinds_of_installed_packages(tmp_path: Path) -> None:
+    module = """
+from unshade.nodes import Kind, Parameter, Role, register
+from unshade.shading import facing
+def glow(normals, direction):
+    return facing(normals, direction).clamp(min=0.0) ** 4
+register(Kind("glow", Role.HIGHLIGHT, glow, (Parameter("direction", "direction", "where", -1.0, 1.0, (0.0, 0.0, 1.0)),), "a glow"))
+"""
+    (tmp_path / "glowing.py").write_text(module, encoding="utf-8")
+    (tmp_path / "glowing-1.dist-info").mkdir()
+    (tmp_path / "glowing-1.dist-info" / "METADATA").write_text("Name: glowing\nVersion: 1\n", encoding="utf-8")
+    announced = tmp_path / "glowing-1.dist-info" / "entry_points.txt"
+    announced.write_text("[unshade.kinds]\nglow = glowing\n", encoding="utf-8")
+    tree = tmp_path / "tree.txt"
+    tree.write_text("screen(albedo(#336699), glow(up))", encoding="utf-8")
+
+    def shown() -> subprocess.CompletedProcess[str]:
+        environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+        command = [sys.executable, "-m", "unshade", "info", str(tree)]
+        return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+    done = shown()
+    assert done.returncode == 0, done.stderr
+    assert "glow" in done.stdout
+    (tmp_path / "glowing.py").write_text("raise RuntimeError('no licence')\n", encoding="utf-8")
+    broken = shown()
+    assert broken.returncode == 4
+    assert "glowing" in broken.stderr and "no licence" in broken.stderr and "Traceback" not in broken.stderr
+    announced.unlink()
+    assert "unknown kind 'glow'" in shown().stderr

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import metadata
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -479,10 +480,26 @@ class Family:
 
 def kind_of(name: str) -> Kind:
     """The leaf kind of this name. Raises TreeError with the nearest known word."""
-    try:
-        return KINDS[name]
-    except KeyError:
-        raise TreeError(f"unknown kind {name!r}{did_you_mean(name, [*KINDS, *BLENDS])}") from None
+    if not is_kind(name):
+        raise TreeError(f"unknown kind {name!r}{did_you_mean(name, [*KINDS, *BLENDS])}")
+    return KINDS[name]
+
+
+def is_kind(name: str) -> bool:
+    """Is this a kind of leaf, perhaps one of an installed package? Raises TreeError where such a package is broken."""
+    if name not in KINDS and name not in BLENDS:
+        _import_kinds()
+    return name in KINDS
+
+
+@lru_cache(maxsize=1)
+def _import_kinds() -> None:
+    """Import the modules that installed packages announce as entry points ``unshade.kinds``; they register their kinds."""
+    for point in metadata.entry_points(group="unshade.kinds"):
+        try:
+            point.load()
+        except Exception as error:  # it is their code, and the message has to say whose
+            raise TreeError(f"{point.value}: the module that adds kinds of leaves cannot be imported ({error})") from error
 
 
 def leaf(kind: str, name: str | None = None, **values: object) -> Leaf:

@@ -27,7 +27,7 @@ from unshade.blend import BLENDS
 from unshade.errors import TreeError, TreeSyntaxError, did_you_mean
 from unshade.files import write_whole
 from unshade.grammar import check_size
-from unshade.nodes import KINDS, MAX_NODES, Family, Kind, Leaf, Member, Node, Operator, Parameter, Raster, Role, Tree, Value, depth_limit
+from unshade.nodes import KINDS, MAX_NODES, Family, Kind, Leaf, Member, Node, Operator, Parameter, Raster, Role, Tree, Value, depth_limit, is_kind
 from unshade.rasters import raster_from_base64, raster_to_base64
 from unshade.text import number_text, parse, to_text
 
@@ -282,7 +282,7 @@ class _Reader:
         kind = value.get("kind")
         if not isinstance(kind, str):
             _fault(where, "'kind' is missing" if kind is None else f"'kind' must be a string, got {_type(kind)}")
-        if kind not in BLENDS and kind not in KINDS:
+        if kind not in BLENDS and not is_kind(kind):
             _fault(where, f"unknown kind {kind[:40]!r}{did_you_mean(kind, [*KINDS, *BLENDS])}")
         try:
             return self.operator(kind, value, where, depth) if kind in BLENDS else self.leaf(KINDS[kind], value, where)

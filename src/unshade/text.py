@@ -22,7 +22,7 @@ from typing import Literal, NoReturn, cast
 from unshade.blend import BLENDS
 from unshade.errors import TreeError, TreeSyntaxError, did_you_mean
 from unshade.grammar import check_size
-from unshade.nodes import KINDS, MAX_NODES, Kind, Leaf, Node, Operator, Parameter, Raster, Role, Tree, Value, depth_limit
+from unshade.nodes import KINDS, MAX_NODES, Kind, Leaf, Node, Operator, Parameter, Raster, Role, Tree, Value, depth_limit, is_kind
 from unshade.rasters import raster_from_base64, raster_to_base64
 
 DIRECTION_WORDS = {
@@ -194,7 +194,7 @@ class _Parser:
         column, kind = self.column, self.token
         if self.type != "word":
             self.fault(f"expected a node such as albedo(...), got {self.here}")
-        if kind not in BLENDS and kind not in KINDS:
+        if kind not in BLENDS and not is_kind(kind):
             self.fault(f"unknown kind {kind!r}{did_you_mean(kind, [*KINDS, *BLENDS])}")
         self.nodes += 1
         if self.nodes > MAX_NODES:
