@@ -16,7 +16,7 @@ import torch
 
 from unshade.atoms import Dictionary
 from unshade.errors import MissingWeightsError, PictureError, TreeError, did_you_mean
-from unshade.fit.least_squares import COARSE_SIZE, fit_least_squares
+from unshade.fit.least_squares import COARSE_SIZE, error_of, fit_least_squares
 from unshade.fit.pixels import Pixels
 from unshade.growth import Effort, Samples, outline
 from unshade.metrics import psnr
@@ -67,8 +67,8 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class Step:
-    """A tree on the way. Trees improve within a stage; ``done`` of ``total`` says how far the work is, and ``psnr`` in dB is
-    measured on some of the pixels until the end. `Decomposition` remembers the best."""
+    """The best tree so far. ``psnr`` in dB is measured on some of the pixels and never falls until the last step, which is the
+    choice, measured on all: perhaps a smaller tree than the one before. ``done`` of ``total`` says how far the work is."""
 
     tree: Tree
     psnr: float
@@ -350,10 +350,13 @@ def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int, 
     share = preset.effort.max_values
     total = share * alternatives
     main = begin(samples, preset.effort)
-    done = 0
+    done, best, least = 0, None, math.inf
     for stage, found in main.run():
+        error = error_of(samples.points, found.root)
+        if best is None or error < least:
+            best, least = found, error
         done = min(max(done, found.values // 2 if stage in ("start", "grow", "plain", "propose") else 3 * found.values // 4), share - 1)
-        yield Step(Tree(found.root, exposure=sphere.exposure), _decibels(found.error), found.values, stage, done, total)
+        yield Step(Tree(best.root, exposure=sphere.exposure), _decibels(least), best.values, stage, done, total)
     chosen = _member(sphere, found.root)
     others: list[Member] = []
     for left_out in _left_out() if alternatives > 1 else ():
