@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 import math
 
@@ -125,7 +126,12 @@ class TestDatasets:
         folder.mkdir()
         for number in range(10):
             (folder / f"{number}.png").touch()
-        assert [case.name for case in datasets.find_cases("many", tmp_path, 2)] == ["2.png", "7.png"]
+        assert [case.name for case in datasets.find_cases("many", tmp_path, 2)] == ["0.png", "5.png"]
+        for limit in range(1, 60):
+            fewer, more = datasets.spread(142, limit), datasets.spread(142, limit + 1)
+            assert set(fewer) < set(more)
+            gaps = [b - a for a, b in itertools.pairwise([*more, more[0] + 142])]
+            assert max(gaps) <= 3 * 142 / (limit + 1)
 
 
 class TestMethods:
@@ -256,6 +262,19 @@ class TestReport:
         found = report.curve(rows)
         assert [(point["values"], point["median"]) for point in found] == [(8, 22.0), (12, 35.0)]
         assert report.curve([row_of()]) == []
+
+    def test_methods_with_fewer_pictures_are_also_compared_on_those(self):
+        def document(method, figures):
+            rows = [{"name": name, "psnr": psnr} for name, psnr in figures.items()]
+            where = {"machine": {"processor": "p", "cores": 2, "system": "s"}, "versions": {}}
+            return {"dataset": "wild", "method": method, "summary": report.summary(rows), "pictures": rows} | where
+
+        fast, slow = document("fast", {"a": 30.0, "b": 20.0, "c": 10.0}), document("slow", {"a": 25.0})
+        page = report.table([fast, slow])
+        assert "| fast | 3 | 20.0 / 20.0 / 12.0 |" in page
+        assert "Only the 1 pictures that all of these methods had" in page
+        assert "| fast | 1 | 30.0 / 30.0 / 30.0 |" in page
+        assert "Only" not in report.table([slow, document("other", {"a": 1.0})])
 
     def test_the_page_does_not_change_when_nothing_did(self, tmp_path):
         documents = [report.document(bench.Options(), "set", "adam:4", [row_of()])]

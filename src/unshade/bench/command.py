@@ -29,7 +29,7 @@ class BenchError(UnshadeError):
     "methods",
     multiple=True,
     metavar="NAME",
-    help="adam:K, basin:K, second:K (K highlights), search:PRESET, learned:PRESET or hybrid:PRESET; may be repeated. "
+    help="adam:K, basin:K, second:K (K highlights), search:PRESET, depth:PRESET, learned:PRESET or hybrid:PRESET; may be repeated. "
     f"Default: {', '.join(METHODS)}.",
 )
 @click.option(

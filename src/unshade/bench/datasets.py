@@ -18,6 +18,9 @@ from unshade.types import Image, Mask
 INSCRIBED = ("wild", "layered")
 """Sets whose spheres fill the frame; in the others the sphere is found by itself."""
 
+GOLDEN = (5.0**0.5 - 1.0) / 2.0
+"""Its multiples modulo 1 fall evenly, however many there are."""
+
 BLACK = 4.0 / 255.0
 """A diffuse layer that is nowhere brighter holds no diffuse part."""
 
@@ -53,8 +56,13 @@ def find_cases(dataset: str, data: Path, limit: int | None) -> list[Case]:
         return []
     paths = [path for path in find_pictures([folder]) if not path.stem.endswith((".diffuse", ".specular"))]
     if limit is not None and limit < len(paths):
-        paths = [paths[(2 * k + 1) * len(paths) // (2 * limit)] for k in range(limit)]
+        paths = [paths[k] for k in spread(len(paths), limit)]
     return [Case(dataset, path.name, path) for path in paths]
+
+
+def spread(count: int, limit: int) -> list[int]:
+    """``limit`` of ``count`` places, spread evenly, so that those of a smaller limit are among those of a larger one."""
+    return sorted(sorted(range(count), key=lambda k: k * GOLDEN % 1.0)[:limit])
 
 
 def load(case: Case, seed: int) -> Subject:

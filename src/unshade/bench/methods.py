@@ -2,7 +2,8 @@
 
 ``adam:K``, ``basin:K`` and ``second:K`` fit the numbers of one fixed structure,
 ``screen(multiply(albedo, diffuse), K tinted highlights, a tinted rim)``, from the same start; only the optimiser differs.
-``search:PRESET``, ``learned:PRESET`` and ``hybrid:PRESET`` are the whole of `unshade.decompose` by that method.
+``search:PRESET``, ``learned:PRESET`` and ``hybrid:PRESET`` are the whole of `unshade.decompose` by that method, and
+``depth:PRESET`` is its search by depth, the paper's second stage.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from unshade.nodes import Node, Operator, Tree, leaf, multiply, screen
 from unshade.pictures import SphereImage
 from unshade.types import Image, Mask
 
-Proposing: TypeAlias = Literal["search", "learned", "hybrid"]
+Proposing: TypeAlias = Literal["search", "learned", "hybrid", "depth"]
 
-TABLE = ("adam", "basin", "second", "search", "learned", "hybrid")
+TABLE = ("adam", "basin", "second", "depth", "search", "learned", "hybrid")
 
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
@@ -41,7 +42,7 @@ class Outcome:
 def method_of(name: str) -> Callable[[SphereImage, Mask, int], Outcome]:
     """The method of a name such as ``second:4`` or ``search:best``. Raises UnshadeError."""
     kind, _, argument = name.partition(":")
-    if kind in ("search", "learned", "hybrid"):
+    if kind in ("search", "learned", "hybrid", "depth"):
         return partial(_decomposed, preset=argument or "balanced", method=cast(Proposing, kind))
     if kind not in TABLE:
         raise UnshadeError(f"unknown method {name!r}{did_you_mean(kind, TABLE)}")
@@ -73,13 +74,16 @@ def _fit(kind: str, image: Image, scored: Mask, root: Node, seed: int) -> Node:
 def _decomposed(sphere: SphereImage, scored: Mask, seed: int, *, preset: str, method: Proposing) -> Outcome:
     from unshade.decompose import decompose
 
-    if method != "search":
+    if method in ("learned", "hybrid"):
         # `decompose` would search where the hybrid has no networks; a row must be what it says.
         from unshade.inference import Networks
 
         Networks.load()
 
-    result = decompose(sphere, preset=preset, seed=seed, method=method).result()
+    if method == "depth":
+        result = decompose(sphere, preset=preset, seed=seed, search="depth").result()
+    else:
+        result = decompose(sphere, preset=preset, seed=seed, method=method).result()
     return Outcome(result.tree, tuple((member.values, member.psnr) for member in result.family.members))
 
 

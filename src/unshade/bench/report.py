@@ -193,6 +193,9 @@ def table(documents: Sequence[dict[str, Any]]) -> str:
     for dataset in dict.fromkeys(document["dataset"] for document in documents):
         chosen = [document for document in documents if document["dataset"] == dataset]
         lines += [f"## {dataset}", "", *_table_of(chosen), ""]
+        shared = _shared(chosen)
+        if shared:
+            lines += [f"Only the {shared[0]['summary']['pictures']} pictures that all of these methods had:", "", *_table_of(shared), ""]
     lines += [CONTEXT, PAPER]
     seen = {json.dumps([document["machine"], document["versions"]], sort_keys=True): document for document in documents}
     lines.append("## Where")
@@ -238,6 +241,15 @@ COLUMNS: tuple[tuple[str, str, Cell], ...] = (
     ("light_degrees", "lights, degrees", _median("light_degrees", 2)),
     ("color_ciede2000", "colours, CIEDE2000", _median("color_ciede2000", 2)),
 )
+
+
+def _shared(documents: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The same documents cut to the pictures that all have; none where nothing is cut or nothing is left."""
+    names = [{row["name"] for row in document["pictures"]} for document in documents]
+    common = set.intersection(*names)
+    if not common or all(own == common for own in names):
+        return []
+    return [document | {"summary": summary([row for row in document["pictures"] if row["name"] in common])} for document in documents]
 
 
 def _table_of(documents: Sequence[dict[str, Any]]) -> list[str]:
