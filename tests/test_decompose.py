@@ -14,10 +14,9 @@ from unshade.grammar import same_structure, sample, structure_key, validate
 from unshade.metrics import psnr
 from unshade.nodes import KINDS, Leaf, Node, Tree, leaf, mix, multiply, screen
 from unshade.picture_output import write_picture
-from unshade.pictures import SphereImage, read_sphere
+from unshade.pictures import Disc, SphereImage, read_sphere
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
-from unshade.sphere_finder import Disc
 
 TRUE = screen(
     multiply(leaf("albedo", color=(0.7, 0.3, 0.2)), leaf("diffuse", direction=(-0.3, 0.6, 0.7), ambient=0.3)),
@@ -266,3 +265,13 @@ def test_no_picture(tmp_path: Path) -> None:
         decompose(tmp_path / "nothing.png")
     with pytest.raises(PictureError, match="expected finite numbers"):
         decompose(torch.full((3, 64, 64), float("nan")))
+
+
+def test_a_sampled_environment_is_found_as_one() -> None:
+    truth = sample(torch.Generator().manual_seed(7_000_011), "realistic", environment=True)
+    image = (render(truth, sphere_normals(256)) * 255.0).round() / 255.0
+    found = decompose(SphereImage(image, disc_mask(256), Disc(128.0, 128.0, 128.0, 1.0))).result()
+    assert found.psnr >= 50.0
+    assert same_structure(found.tree, truth)
+    environment = next(node for _, node in found.tree.walk() if node.kind == "environment")
+    assert isinstance(environment, Leaf) and environment.lobes >= 2

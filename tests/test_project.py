@@ -22,7 +22,7 @@ LONGEST = {"src": 400, "scripts": 400, "tests": 650}
 LONGER_FILES = {
     "src/unshade/cli.py": ("every verb with its help", 480),
     "src/unshade/sphere_finder.py": ("one search for one circle", 470),
-    "src/unshade/nodes.py": ("the table of leaf kinds is part of it", 640),
+    "src/unshade/nodes.py": ("the table of leaf kinds is part of it", 650),
 }
 
 

@@ -8,12 +8,13 @@ from hypothesis import given, settings
 
 import strategies
 from unshade.atoms import FAMILIES, Dictionary, directions
+from unshade.changes import removals, swaps
 from unshade.fit.least_squares import error_of, fit_pixels
 from unshade.fit.model import Model
 from unshade.fit.pixels import Pixels
 from unshade.grammar import validate
 from unshade.growth import Candidate, Front
-from unshade.moves import Anatomy, Move, Proposer, add_light, add_shade, complement, is_paint, recolored, removals, swaps
+from unshade.moves import Anatomy, Move, Proposer, add_light, add_shade, complement, is_paint, recolored
 from unshade.nodes import MAX_NODES, Leaf, Node, count_values, find, leaf, mix, multiply, screen, walk
 from unshade.render import render
 from unshade.sphere import sphere_normals
@@ -35,7 +36,8 @@ def small_pixels(root: Node, size: int = 32) -> Pixels:
 
 
 def leaf_count(root: Node) -> int:
-    return sum(isinstance(node, Leaf) for _, node in walk(root))
+    """Leaves, every light of an environment by itself."""
+    return sum(node.lobes for _, node in walk(root) if isinstance(node, Leaf))
 
 
 def kinds(root: Node) -> list[str]:

@@ -160,6 +160,7 @@ FAMILIES = {
     "plain_spots": spots,
     "plain_masks": plain_masks,
     "plain_shades": plain_shades,
+    "plain_environments": environments,
     "lights": lights,
     "spots": spots,
     "environments": environments,

@@ -8,20 +8,19 @@ import math
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import torch
 
-from unshade.atoms import Dictionary
 from unshade.errors import MissingWeightsError, PictureError, TreeError, did_you_mean
-from unshade.fit.least_squares import COARSE_SIZE, error_of, fit_least_squares
-from unshade.fit.pixels import Pixels
+from unshade.fit.least_squares import error_of, fit_least_squares
 from unshade.growth import Effort, Samples, outline
 from unshade.metrics import psnr
 from unshade.nodes import Family, Member, Node, Tree, find_address
 from unshade.pictures import SphereImage, read_sphere, sphere_from_array
+from unshade.pixel_sets import samples_of
 from unshade.render import render, srgb_decode
 from unshade.search import Search
 from unshade.sphere import sphere_normals
@@ -32,9 +31,6 @@ if TYPE_CHECKING:
 
 METHODS = ("search", "learned", "hybrid")
 """Who proposes structures: the search, networks alone as in the paper, or networks and the search together."""
-
-POINTS = 2500
-"""Points of the full picture on which trees grow once they are good."""
 
 
 @dataclass(frozen=True)
@@ -285,27 +281,6 @@ def _decibels(error: float) -> float:
     return -10.0 * math.log10(max(error, 1e-10))
 
 
-@lru_cache(maxsize=4)
-def _dictionary(key: tuple[int, ...]) -> list[Dictionary]:
-    """A cell for the dictionary of one set of normals; all pictures of one size and mask share it."""
-    return []
-
-
-def _shared_dictionary(pixels: Pixels) -> Dictionary:
-    normals = pixels.normals
-    cell = _dictionary((normals.shape[1], hash(normals.numpy().tobytes())))
-    if not cell:
-        cell.append(Dictionary(normals))
-    return cell[0]
-
-
-def _samples(sphere: SphereImage, preset: Preset, seed: int) -> Samples:
-    coarse = Pixels.of(sphere.image, sphere.valid, COARSE_SIZE)
-    points = Pixels.points(sphere.image, sphere.valid, POINTS, seed)
-    fine = Pixels.important(sphere.image, sphere.valid, preset.fine, seed)
-    return Samples(coarse, points, fine, _shared_dictionary(coarse), _shared_dictionary(points))
-
-
 def _without_gradients(work: Iterator[Step | Result]) -> Iterator[Step | Result]:
     """Take each step in inference mode, which is faster; the caller between steps is not in it."""
     while True:
@@ -346,7 +321,7 @@ def _learned(
 
 
 def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int, begin: Begin = Search) -> Iterator[Step | Result]:
-    samples = _samples(sphere, preset, seed)
+    samples = samples_of(sphere, preset.fine, seed)
     share = preset.effort.max_values
     total = share * alternatives
     main = begin(samples, preset.effort)

@@ -23,6 +23,7 @@ from typing import Any, Literal
 import torch
 
 from unshade import search_depth
+from unshade.changes import removals, swaps
 from unshade.decoded import SIZE, dictionary_of
 from unshade.fit.basin_cma import fit_basin_cma
 from unshade.fit.gradient import fit_gradient
@@ -31,7 +32,6 @@ from unshade.fit.model import soften
 from unshade.fit.pixels import Pixels
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
 from unshade.inference import Inference, Networks, Part, Pool, Round, infer, node_image
-from unshade.moves import removals, swaps
 from unshade.nodes import Node, count_values
 from unshade.proposals import Fits
 from unshade.search import Search

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
+from unshade.changes import removals, swaps
 from unshade.fit.least_squares import FINE_SOFTNESS, fit_pixels
 from unshade.fit.pixels import Pixels
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
-from unshade.moves import removals, swaps
 from unshade.nodes import count_values
-from unshade.search_drawn import DRAWN, DrawnSearch, looks_drawn
+from unshade.search_drawn import DRAWN, REFLECTING, DrawnSearch, looks_drawn, may_reflect
 
 ALL = ("lights", "masks", "shades", "spots", "rims", "environments")
 """Every family of leaves."""
@@ -59,11 +59,24 @@ class Search(Growth):
                 current = better
                 yield "exchange", current
         current = self.sharpen(current)
-        if self.effort.beam and self.complete and looks_drawn(current):
-            current = DrawnSearch(self.samples, self.effort).prune(current)
+        if self.effort.beam and self.complete:
+            if may_reflect(current):
+                current = yield from self._with_environment(current)
+            if looks_drawn(current):
+                current = DrawnSearch(self.samples, self.effort).prune(current)
         if plain and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
             current = plain
         yield "polish", current
+
+    def _with_environment(self, current: Candidate) -> Generator[tuple[str, Candidate], None, Candidate]:
+        """The tree of the released grammar with an environment, if that is better."""
+        drawn = DrawnSearch(self.samples, self.effort, REFLECTING)
+        found = yield from drawn.run(self.rough.members())
+        if found is None or self.judge(found.error, found.values) >= self.judge(current.error, current.values):
+            return current
+        self.front.update(drawn.front)
+        self.rough.update(drawn.rough)
+        return found
 
     def _sweep(self, current: Candidate, pixels: Pixels) -> Candidate:
         """Offer every leaf another kind, or none at all, until nothing pays."""

@@ -9,19 +9,25 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Iterator
 
+from unshade.changes import paints_as_shades, removals, swaps
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
 from unshade.fit.model import NO_LIMITS, Limits, Model, is_hard, soften
-from unshade.growth import FLOOR, Candidate, Growth
-from unshade.moves import Anatomy, Proposer, paints_as_shades, removals, swaps
+from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
+from unshade.moves import Anatomy, Proposer
 from unshade.nodes import Leaf, Node, count_values, find, walk
 
 PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots", "plain_rims")
-"""The families of the released grammar: all lights grey, edges drawn."""
-PLAIN_LIMITS: Limits = {"softness": (0.0, 0.15), "sharpness": (20.0, 150.0), "exponent": (0.7, 1.5), "radius": (0.0, 0.8)}
+"""The families of the released grammar without its environments: all lights grey, edges drawn."""
+REFLECTING = (*PLAIN, "plain_environments")
+"""All families of the released grammar."""
+PLAIN_LIMITS: Limits = {"softness": (0.0, 0.15), "highlight.sharpness": (20.0, 150.0), "exponent": (0.7, 1.5), "radius": (0.0, 0.8)}
 """Its ranges, a little wider, so that a fit does not turn a spot into something else."""
 
 DRAWN = 1.0e-5
 """A plain tree with a mean squared error under this one is the answer: the picture was drawn with such a tree."""
+
+ROUNDING = 3.0e-6
+"""A tree under this error is the picture but for the rounding to 8 bits."""
 
 LARGEST_DRAWN = 56
 """Values of the largest tree of the released grammar, and one detour more."""
@@ -54,6 +60,10 @@ PHOTOGRAPHIC = 1.0e-3
 class DrawnSearch(Growth):
     """`run` yields better and better candidates and returns the best, or None where the picture was not drawn."""
 
+    def __init__(self, samples: Samples, effort: Effort, families: tuple[str, ...] = PLAIN) -> None:
+        super().__init__(samples, effort)
+        self.families = families
+
     def run(self, curve: list[Candidate]) -> Generator[tuple[str, Candidate], None, Candidate | None]:
         """Beam search with only the words of the released grammar, which a drawn or sampled picture may be made of.
 
@@ -65,7 +75,7 @@ class DrawnSearch(Growth):
         best, stale = min(states, key=self._drawn), 0
         leaders: list[Candidate] = []
         while stale < 2:
-            options = self._extended(states, proposer, PLAIN, effort.beam_moves, 4)
+            options = self._extended(states, proposer, self.families, effort.beam_moves, 4)
             states = [self._coarse(option.root, 8) for option in lineages(sorted(options, key=self._drawn), effort.beam)]
             if not states:
                 break
@@ -86,7 +96,7 @@ class DrawnSearch(Growth):
             return sharp
         points, dictionary = self.samples.points, self.samples.points_dictionary
         grown = self.fit(sharp.root, points, effort.growth_steps, limits=PLAIN_LIMITS)
-        for grown in self.grow(grown, points, dictionary, FLOOR, PLAIN, PLAIN_LIMITS):
+        for grown in self.grow(grown, points, dictionary, FLOOR, self.families, PLAIN_LIMITS):
             yield "plain", grown
             if grown.values >= LARGEST_DRAWN:
                 break
@@ -149,7 +159,7 @@ class DrawnSearch(Growth):
         moved = [root for candidate in sorted(smaller, key=settled)[:3] for root in swaps(candidate.root)]
         for candidate in smaller:
             model = Model(candidate.root, points)
-            moved += [move.root for move in proposer.propose(model, model.layout.pack(candidate.root), PLAIN, 2)]
+            moved += [move.root for move in proposer.propose(model, model.layout.pack(candidate.root), self.families, 2)]
         return self._sharpest(current, moved)
 
     def _sharpest(self, current: Candidate, roots: list[Node], limits: Limits = PLAIN_LIMITS) -> Candidate | None:
@@ -207,8 +217,17 @@ class DrawnSearch(Growth):
 
 def looks_drawn(candidate: Candidate) -> bool:
     """Is a tree so near, or so near and with hard edges, that the picture was drawn?"""
-    edges = any(isinstance(node, Leaf) and is_hard(node) for _, node in walk(candidate.root))
-    return candidate.error < (4.0 * DRAWN if edges else DRAWN)
+    return candidate.error < (4.0 * DRAWN if has_edges(candidate.root) else DRAWN)
+
+
+def may_reflect(candidate: Candidate) -> bool:
+    """Has a tree that is not quite the picture hard edges, or is it so near, that an environment may be all it lacks?"""
+    return candidate.error > ROUNDING and (has_edges(candidate.root) or candidate.error < 1.5 * DRAWN)
+
+
+def has_edges(root: Node) -> bool:
+    """Has any leaf a hard edge?"""
+    return any(isinstance(node, Leaf) and is_hard(node) for _, node in walk(root))
 
 
 def settled(candidate: Candidate) -> float:
@@ -234,6 +253,11 @@ def form_of(root: Node) -> tuple[str, ...]:
     return tuple(find(root, address).kind for address in Anatomy.of(root).forms)
 
 
+def line_of(root: Node) -> tuple[str, ...]:
+    """What tells the lines of a beam apart: the form, and whether there is a rim or an environment."""
+    return (*form_of(root), *sorted({node.kind for _, node in walk(root)} & {"rim", "environment"}))
+
+
 def _is_stuck(leaders: list[Candidate]) -> bool:
     """Do the last two leaves explain too little? Every part of a drawn picture lowers its error by a good share."""
     if len(leaders) < 3:
@@ -249,10 +273,10 @@ def lineages(candidates: list[Candidate], each: int) -> list[Candidate]:
     it, which is nearly always the same tree.
     """
     bar = HOPELESS * min((candidate.error for candidate in candidates), default=0.0)
-    lines: dict[tuple[tuple[str, ...], bool], list[Candidate]] = {}
+    lines: dict[tuple[str, ...], list[Candidate]] = {}
     chosen = []
     for candidate in candidates:
-        line = lines.setdefault((form_of(candidate.root), any(node.kind == "rim" for _, node in walk(candidate.root))), [])
+        line = lines.setdefault(line_of(candidate.root), [])
         if len(line) < each and candidate.error <= bar and not any(_are_twins(candidate, other) for other in line):
             line.append(candidate)
             chosen.append(candidate)

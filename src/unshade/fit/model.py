@@ -68,7 +68,7 @@ class Model:
 
     Args:
         root: the structure. pixels: where. locked: addresses of leaves, subtrees or ``address.parameter`` that are kept.
-        softest: least softness of an edge. limits: narrower ranges by parameter name.
+        softest: least softness of an edge. limits: narrower ranges by ``parameter`` or ``kind.parameter``.
     """
 
     def __init__(self, root: Node, pixels: Pixels, locked: Collection[str] = (), softest: float = 0.0, limits: Limits = NO_LIMITS) -> None:
@@ -141,9 +141,9 @@ class Model:
         self.directions = self.number[torch.tensor([tangent == 0 for _, tangent in flat], dtype=torch.bool)]
         self.spread = self.directions[:, None] + torch.arange(3)
         self.tangential = _rows(~self.plain)
-        names = [layout.names[number].rsplit(".", 1)[-1] for number, _ in flat]
-        low = torch.tensor([limits.get(name, (-math.inf, math.inf))[0] for name in names], dtype=torch.float64)
-        high = torch.tensor([limits.get(name, (-math.inf, math.inf))[1] for name in names], dtype=torch.float64)
+        names = [(g.kind, KINDS[g.kind].parameters[p].name) for g in self.groups for _ in g.leaves for p, _, _ in g.pattern]
+        ranges = [limits.get(f"{kind}.{name}", limits.get(name, (-math.inf, math.inf))) for kind, name in names]
+        low, high = torch.tensor(ranges, dtype=torch.float64).reshape(-1, 2).unbind(1)
         self.low = torch.where(self.plain, layout.lower[self.number].maximum(low), -torch.inf)
         self.high = torch.where(self.plain, layout.upper[self.number].minimum(high), torch.inf)
 
