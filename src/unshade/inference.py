@@ -61,7 +61,8 @@ class Inference:
 
     samples: int = 16
     """T, drawn of each node."""
-    temperature: float = 1.0
+    temperature: float = 0.7
+    """Of the priors: under 1 likely codes become likelier."""
     depth: int = 5
     """Levels of operators; a node that is not a leaf below them is left over."""
     nodes: int = 16
@@ -74,8 +75,8 @@ class Inference:
     """gamma"""
     stop: float = 0.08
     """tau, on the scale of L_recon: 0.08 is 22 dB."""
-    trees: int = 1
-    """Pools kept side by side."""
+    trees: int = 3
+    """Pools kept side by side; the paper keeps one."""
     choices: int = 3
     """Decompositions of a node that pools may differ in."""
 
