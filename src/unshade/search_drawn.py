@@ -44,6 +44,9 @@ UNLIKE = 2.5e-4
 LAGGING = 1.3
 """No drawn picture is twice in turn explained this many times worse by plain words than by all words in trees as large."""
 
+PATIENCE = 2.0
+"""With an environment, a light costs half as much again, and the curve is that of longer searches."""
+
 LEAST_DESCENT = 0.05
 """Fall of log(error) a value, over two leaves, of plain trees on the way to a drawn picture; photographs give less."""
 
@@ -124,8 +127,10 @@ class DrawnSearch(Growth):
     def _is_photograph(self, leaders: list[Candidate], best: Candidate, curve: list[Candidate]) -> bool:
         """Do the plain words fall behind all words, twice in turn or by far, or do they explain too little?"""
 
+        patience = PATIENCE if "plain_environments" in self.families else 1.0
+
         def lag(leader: Candidate) -> float:
-            return leader.error / min((rival.error for rival in curve if rival.values <= leader.values), default=math.inf)
+            return leader.error / patience / min((rival.error for rival in curve if rival.values <= leader.values), default=math.inf)
 
         if len(leaders) > 1 and all(leader.values >= 12 and lag(leader) > LAGGING for leader in leaders[-2:]):
             return True
