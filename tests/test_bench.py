@@ -272,7 +272,7 @@ class TestReport:
         fast, slow = document("fast", {"a": 30.0, "b": 20.0, "c": 10.0}), document("slow", {"a": 25.0})
         page = report.table([fast, slow])
         assert "| fast | 3 | 20.0 / 20.0 / 12.0 |" in page
-        assert "Only the 1 pictures that all of these methods had" in page
+        assert "Only the pictures that all of these methods had, 1 in number" in page
         assert "| fast | 1 | 30.0 / 30.0 / 30.0 |" in page
         assert "Only" not in report.table([slow, document("other", {"a": 1.0})])
 

@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import torch
 
+from unshade.fit.pixels import Pixels
 from unshade.nodes import KINDS, Leaf, leaf
 
 
@@ -35,6 +36,13 @@ class Atoms:
     """(M, N)"""
     scalable: torch.Tensor
     """(M,) bool, true where the leaf has an amplitude of its own."""
+
+    def project(self, basis: torch.Tensor, residual: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """For every leaf, ``basis`` times its picture against the residual and against itself, (3, M) each.
+
+        Their ratio is the colour of the leaf that lowers the squared error most, where it is added as ``basis * color * picture``.
+        """
+        return (weight * basis * residual) @ self.pictures.T, (weight * basis.square()) @ self.squares.T
 
 
 def _render(leaves: list[Leaf], normals: torch.Tensor) -> Atoms:
@@ -185,3 +193,14 @@ class Dictionary:
         if family not in self._families:
             self._families[family] = _render(_leaves(family), self.normals)
         return self._families[family]
+
+
+def dictionary_of(pixels: Pixels) -> Dictionary:
+    """The dictionary at the pixels of a picture; all pictures of one size and mask share it."""
+    return _dictionary(pixels.normals.contiguous().numpy().tobytes())
+
+
+@lru_cache(maxsize=4)
+def _dictionary(normals: bytes) -> Dictionary:
+    """Of (3, N) float32 normals."""
+    return Dictionary(torch.frombuffer(bytearray(normals), dtype=torch.float32).view(3, -1))

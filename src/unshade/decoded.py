@@ -6,11 +6,10 @@ A decoded picture is a little coloured and a little blurred, whatever its leaf i
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
 
 import torch
 
-from unshade.atoms import Dictionary
+from unshade.atoms import dictionary_of
 from unshade.fit.least_squares import COARSE_SOFTNESS, fit_pixels
 from unshade.fit.pixels import Pixels
 from unshade.nodes import KINDS, Leaf, Role, leaf
@@ -83,20 +82,6 @@ def _best(pixels: Pixels, starts: list[Leaf]) -> Leaf:
     found = min(fitted, key=lambda fit: fit.error).root
     assert isinstance(found, Leaf)
     return found
-
-
-@lru_cache(maxsize=4)
-def _cell(count: int, key: int) -> list[Dictionary]:
-    """Of one set of normals; all decoded pictures of one size share it."""
-    return []
-
-
-def dictionary_of(pixels: Pixels) -> Dictionary:
-    """The dictionary at the pixels of decoded pictures."""
-    cell = _cell(pixels.count, hash(pixels.normals.numpy().tobytes()))
-    if not cell:
-        cell.append(Dictionary(pixels.normals))
-    return cell[0]
 
 
 def _nearest(pixels: Pixels, kind: str) -> Iterator[Leaf]:

@@ -23,8 +23,9 @@ from typing import Any, Literal
 import torch
 
 from unshade import search_depth
+from unshade.atoms import dictionary_of
 from unshade.changes import removals, swaps
-from unshade.decoded import SIZE, dictionary_of
+from unshade.decoded import SIZE
 from unshade.fit.basin_cma import fit_basin_cma
 from unshade.fit.gradient import fit_gradient
 from unshade.fit.least_squares import FINE_SOFTNESS, error_of, fit_pixels

@@ -185,8 +185,7 @@ class Proposer:
     def _lights(self, root: Node, place: _Place, residual: torch.Tensor, family: str, grey_only: bool) -> list[Move]:
         atoms = self.dictionary[family]
         basis = place.gain * (1.0 - place.value)
-        up = (self.weight * basis * residual) @ atoms.pictures.T  # (3, M)
-        down = (self.weight * basis.square()) @ atoms.squares.T
+        up, down = atoms.project(basis, residual, self.weight)
         moves = []
         color = (up / down.clamp(min=1e-12)).clamp(0.0, 1.0)
         saved = (2.0 * color * up - color.square() * down).sum(0) / 3.0
@@ -209,8 +208,7 @@ class Proposer:
     def _lobes(self, root: Node, place: _Place, residual: torch.Tensor, family: str) -> list[Move]:
         """One light more in the environment that the tree has."""
         atoms = self.dictionary[family]
-        up = (self.weight * place.gain * residual) @ atoms.pictures.T
-        down = (self.weight * place.gain.square()) @ atoms.squares.T
+        up, down = atoms.project(place.gain, residual, self.weight)
         color = (up / down.clamp(min=1e-12)).clamp(0.0, 1.0)
         saved = (2.0 * color * up - color.square() * down).sum(0) / 3.0
         assert isinstance(place.node, Leaf)

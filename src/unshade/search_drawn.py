@@ -126,7 +126,6 @@ class DrawnSearch(Growth):
 
     def _is_photograph(self, leaders: list[Candidate], best: Candidate, curve: list[Candidate]) -> bool:
         """Do the plain words fall behind all words, twice in turn or by far, or do they explain too little?"""
-
         patience = PATIENCE if "plain_environments" in self.families else 1.0
 
         def lag(leader: Candidate) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Collection
 
 import torch
 
-from unshade.atoms import Dictionary
+from unshade.atoms import Dictionary, dictionary_of
 from unshade.fit.least_squares import COARSE_SIZE, COARSE_SOFTNESS, fit_pixels
 from unshade.fit.model import Model, is_locked, soften
 from unshade.fit.pixels import Pixels
@@ -34,7 +34,7 @@ def read_off(target: Image, mask: Mask, root: Node, *, seed: int = 0, locked: Co
         target: (3, H, H) in [0, 1]. mask: (1, H, H) bool, pixels that count. locked: addresses that keep their numbers.
     """
     pixels = Pixels.of(target, mask, COARSE_SIZE)
-    dictionary = Dictionary(pixels.normals)
+    dictionary = dictionary_of(pixels)
     generator = torch.Generator().manual_seed(seed)
     root = soften(root, COARSE_SOFTNESS, locked)
     places = _dark_places(root, locked)
@@ -81,8 +81,7 @@ def _lit(pixels: Pixels, dictionary: Dictionary, root: Node, place: str, light: 
     leaf = pair[1] if pair else light
     assert isinstance(leaf, Leaf)
     atoms = dictionary[FAMILIES[leaf.kind]]
-    up = (pixels.weight * gain * wanted) @ atoms.pictures.T
-    down = (pixels.weight * gain.square()) @ atoms.squares.T
+    up, down = atoms.project(gain, wanted, pixels.weight)
     if pair is None:
         up, down = up.sum(0, keepdim=True), down.sum(0, keepdim=True)
     amplitude = KINDS[leaf.kind].amplitude

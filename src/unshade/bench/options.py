@@ -33,8 +33,8 @@ class Options:
     datasets: Sequence[str] = DATASETS
     """Folders of pictures inside ``data``, ``examples``, and ``sampler:STYLE``."""
     methods: Sequence[str] = METHODS
-    """``adam:K``, ``basin:K`` and ``second:K`` fit one structure with K highlights; ``search:PRESET``, ``learned:PRESET`` and
-    ``hybrid:PRESET`` are the whole of `unshade.decompose`."""
+    """``adam:K``, ``basin:K`` and ``second:K`` fit one structure with K highlights; ``search:PRESET``, ``depth:PRESET``,
+    ``learned:PRESET`` and ``hybrid:PRESET`` are the whole of `unshade.decompose`."""
     data: Path | None = None
     out: Path = Path("benchmarks")
     limit: int | None = None

@@ -38,15 +38,16 @@ def curves(documents: Sequence[dict[str, Any]], folder: Path) -> None:
 def _panel(panel: Any, dataset: str, documents: Sequence[dict[str, Any]]) -> None:
     for index, document in enumerate(documents):
         color, found, line = f"C{index % 10}", document["summary"], document["curve"]
+        label = f"{document['method']} ({found['pictures']})"
         if line:
             sizes = [point["values"] for point in line]
-            panel.plot(sizes, [point["median"] for point in line], color=color, label=document["method"])
+            panel.plot(sizes, [point["median"] for point in line], color=color, label=label)
             panel.plot(sizes, [point["p10"] for point in line], color=color, linestyle=":", linewidth=1)
         else:
             size = found["values"]["median"]
-            panel.plot([size], [found["psnr"]["median"]], "o", color=color, label=document["method"])
+            panel.plot([size], [found["psnr"]["median"]], "o", color=color, label=label)
             panel.plot([size], [found["psnr"]["p10"]], "o", color=color, markerfacecolor="none")
-    panel.set_title(f"{dataset} ({documents[0]['summary']['pictures']} pictures)")
+    panel.set_title(f"{dataset}: method (pictures)")
     panel.set_xlabel("values of the tree")
     panel.set_ylabel("PSNR, dB: median (dotted, hollow: 10th percentile)", fontsize=7)
     panel.set_xlim(left=0)

@@ -195,7 +195,12 @@ def table(documents: Sequence[dict[str, Any]]) -> str:
         lines += [f"## {dataset}", "", *_table_of(chosen), ""]
         shared = _shared(chosen)
         if shared:
-            lines += [f"Only the {shared[0]['summary']['pictures']} pictures that all of these methods had:", "", *_table_of(shared), ""]
+            lines += [
+                f"Only the pictures that all of these methods had, {shared[0]['summary']['pictures']} in number:",
+                "",
+                *_table_of(shared),
+                "",
+            ]
     lines += [CONTEXT, PAPER]
     seen = {json.dumps([document["machine"], document["versions"]], sort_keys=True): document for document in documents}
     lines.append("## Where")

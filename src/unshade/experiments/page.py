@@ -205,8 +205,9 @@ def _analogy(document: Document) -> Iterator[str]:
 def _ablation(document: Document) -> Iterator[str]:
     yield f"## {TITLES['ablation']}"
     yield (
-        "`learned:base` draws one sample a node and nothing else; `samples` draws several and picks by the criterion; `second`\n"
-        "adds the second stage for the nodes left over; `full` adds the optimisation of the whole tree, and is the method."
+        "`learned:base` draws one sample a node and nothing else; `samples` draws several, picks by the criterion and keeps\n"
+        "three trees side by side; `second` adds the second stage for the nodes left over; `full` adds the optimisation of the\n"
+        "whole tree, and is the method."
     )
     yield ""
     short = [column for column in COLUMNS if column[0] in ("psnr", "ssim", "st_lpips", "values", "structure", "cpu_seconds")]
