@@ -20,6 +20,9 @@ from unshade.sphere import SCORED_RADIUS, sphere_grid, sphere_normals
 
 COLUMNS = 8
 
+STARTS = 3
+"""Krita beside a busy X server may end, with no error, before it has written."""
+
 
 def expected(tree: Tree, size: int) -> np.ndarray:
     """(size, size, 3) of `render`, each pixel the mean of 4 x 4, since other programs antialias a hard edge."""
@@ -92,8 +95,11 @@ def by_krita(path: Path) -> np.ndarray:
         pytest.skip("needs Krita and Xvfb (apt-get install krita xvfb xauth)")
     picture = path.with_suffix(".krita.png")
     command = ["xvfb-run", "-a", "krita", "--export", "--export-filename", str(picture), str(path)]
-    subprocess.run(command, env={**os.environ, "HOME": str(path.parent)}, capture_output=True, timeout=200, check=False)
-    return np.asarray(Image.open(picture).convert("RGBA")) / 255.0
+    for _ in range(STARTS):
+        done = subprocess.run(command, env={**os.environ, "HOME": str(path.parent)}, capture_output=True, timeout=200, check=False)
+        if picture.is_file():
+            return np.asarray(Image.open(picture).convert("RGBA")) / 255.0
+    raise AssertionError(f"Krita wrote nothing in {STARTS} starts, and ended with {done.returncode}: {done.stderr.decode()[-2000:]}")
 
 
 def by_chromium(browser: str, folder: Path, parts: Sequence[str], size: int, head: str = "") -> list[np.ndarray]:
