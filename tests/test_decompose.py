@@ -15,6 +15,7 @@ from unshade.metrics import psnr
 from unshade.nodes import KINDS, Leaf, Node, Tree, leaf, mix, multiply, screen
 from unshade.picture_output import write_picture
 from unshade.pictures import Disc, SphereImage, read_sphere
+from unshade.pixel_sets import CLEAN, grain
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
 
@@ -28,6 +29,13 @@ def sphere(tree: Tree | Node, size: int = 128, valid: torch.Tensor | None = None
     disc = disc_mask(size)
     image = render(tree, sphere_normals(size))
     return SphereImage(image, disc if valid is None else disc & valid, Disc(size / 2, size / 2, size / 2, 1.0))
+
+
+def rounded(tree: Tree, size: int = 256) -> SphereImage:
+    """The picture as a file of 8 bits holds it."""
+    half = size / 2
+    image = (render(tree, sphere_normals(size)) * 255.0).round() / 255.0
+    return SphereImage(image, disc_mask(size), Disc(half, half, half, 1.0))
 
 
 def figure(found: Tree, picture: SphereImage) -> float:
@@ -267,11 +275,17 @@ def test_no_picture(tmp_path: Path) -> None:
         decompose(torch.full((3, 64, 64), float("nan")))
 
 
-def test_a_sampled_environment_is_found_as_one() -> None:
-    truth = sample(torch.Generator().manual_seed(7_000_011), "realistic", environment=True)
-    image = (render(truth, sphere_normals(256)) * 255.0).round() / 255.0
-    found = decompose(SphereImage(image, disc_mask(256), Disc(128.0, 128.0, 128.0, 1.0))).result()
+@pytest.mark.parametrize("number", [3, 16])
+def test_a_sampled_environment_is_found_as_one(number: int) -> None:
+    truth = sample(torch.Generator().manual_seed(7_000_003 + number), "realistic", environment=True)
+    found = decompose(rounded(truth)).result()
     assert found.psnr >= 50.0
     assert same_structure(found.tree, truth)
-    environment = next(node for _, node in found.tree.walk() if node.kind == "environment")
-    assert isinstance(environment, Leaf) and environment.lobes >= 2
+
+
+def test_grain_tells_renderings_from_photographs(lacquer: SphereImage) -> None:
+    edged = rounded(sample(torch.Generator().manual_seed(3), "toon"))
+    noise = 0.5 / 255.0 * torch.randn(edged.image.shape, generator=torch.Generator().manual_seed(0))
+    noisy = ((edged.image + noise).clamp(0.0, 1.0) * 255.0).round() / 255.0
+    assert grain(edged.image, edged.valid) < CLEAN < min(grain(noisy, edged.valid), grain(lacquer.image, lacquer.valid))
+    assert grain(edged.image, torch.zeros_like(edged.valid)) == 0.0

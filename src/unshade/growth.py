@@ -102,6 +102,8 @@ class Samples:
     fine: Pixels
     coarse_dictionary: Dictionary
     points_dictionary: Dictionary
+    is_clean: bool = False
+    """Is the picture as smooth as rounding to 8 bits leaves a rendering? Then it may be a tree's, to the last digit."""
 
 
 class Growth:

@@ -10,7 +10,8 @@ from unshade.fit.least_squares import FINE_SOFTNESS, fit_pixels
 from unshade.fit.pixels import Pixels
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
 from unshade.nodes import count_values
-from unshade.search_drawn import DRAWN, REFLECTING, DrawnSearch, looks_drawn, may_reflect
+from unshade.search_drawn import DRAWN, DrawnSearch, looks_drawn
+from unshade.search_reflecting import ReflectingSearch, is_edged, may_reflect
 
 ALL = ("lights", "masks", "shades", "spots", "rims", "environments")
 """Every family of leaves."""
@@ -38,15 +39,27 @@ class Search(Growth):
         current = Candidate(self.start(), math.inf)
         for current in self.grow(current, self.samples.coarse, self.samples.coarse_dictionary, 1e-4, self.early):
             yield "grow", current
+        may_be_drawn = bool(self.effort.beam) and self.complete
         plain: Candidate | None = None
-        if self.effort.beam and self.complete:
+        if may_be_drawn:
             drawn = DrawnSearch(self.samples, self.effort)
             plain = yield from drawn.run(self.rough.members())
             self.front.update(drawn.front)
             self.rough.update(drawn.rough)
-            if plain is not None and plain.error < DRAWN:
-                yield "polish", plain
-                return
+        if plain is not None and plain.error < DRAWN:
+            current = plain
+        else:
+            current = yield from self._grown(current)
+        if may_be_drawn and self.samples.is_clean and may_reflect(current, plain):
+            current = yield from self._with_environment(current, plain)
+        if may_be_drawn and current is not plain and looks_drawn(current):
+            current = DrawnSearch(self.samples, self.effort).prune(current)
+        if plain and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
+            current = plain
+        yield "polish", current
+
+    def _grown(self, current: Candidate) -> Generator[tuple[str, Candidate], None, Candidate]:
+        """The tree grown on in all words and points of the full picture, with leaves of other kinds and in other places, sharp."""
         current = self.fit(current.root, self.samples.points, self.effort.growth_steps)
         for current in self.grow(current, self.samples.points, self.samples.points_dictionary, FLOOR, self.families):
             yield "grow", current
@@ -58,19 +71,11 @@ class Search(Growth):
             if self.judge(better.error, better.values) < self.judge(current.error, current.values):
                 current = better
                 yield "exchange", current
-        current = self.sharpen(current)
-        if self.effort.beam and self.complete:
-            if may_reflect(current):
-                current = yield from self._with_environment(current)
-            if looks_drawn(current):
-                current = DrawnSearch(self.samples, self.effort).prune(current)
-        if plain and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
-            current = plain
-        yield "polish", current
+        return self.sharpen(current)
 
-    def _with_environment(self, current: Candidate) -> Generator[tuple[str, Candidate], None, Candidate]:
+    def _with_environment(self, current: Candidate, plain: Candidate | None) -> Generator[tuple[str, Candidate], None, Candidate]:
         """The tree of the released grammar with an environment, if that is better."""
-        drawn = DrawnSearch(self.samples, self.effort, REFLECTING)
+        drawn = ReflectingSearch(self.samples, self.effort, is_edged(current, plain))
         found = yield from drawn.run(self.rough.members())
         if found is None or self.judge(found.error, found.values) >= self.judge(current.error, current.values):
             return current

@@ -11,15 +11,13 @@ from collections.abc import Generator, Iterator
 
 from unshade.changes import paints_as_shades, removals, swaps
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
-from unshade.fit.model import NO_LIMITS, Limits, Model, is_hard, soften
+from unshade.fit.model import NO_LIMITS, Limits, Model, soften
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
 from unshade.moves import Anatomy, Proposer
-from unshade.nodes import Leaf, Node, count_values, find, walk
+from unshade.nodes import KINDS, Leaf, Node, count_values, find, walk
 
 PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots", "plain_rims")
 """The families of the released grammar without its environments: all lights grey, edges drawn."""
-REFLECTING = (*PLAIN, "plain_environments")
-"""All families of the released grammar."""
 PLAIN_LIMITS: Limits = {"softness": (0.0, 0.15), "highlight.sharpness": (20.0, 150.0), "exponent": (0.7, 1.5), "radius": (0.0, 0.8)}
 """Its ranges, a little wider, so that a fit does not turn a spot into something else."""
 
@@ -43,9 +41,6 @@ UNLIKE = 2.5e-4
 
 LAGGING = 1.3
 """No drawn picture is twice in turn explained this many times worse by plain words than by all words in trees as large."""
-
-PATIENCE = 2.0
-"""With an environment, a light costs half as much again, and the curve is that of longer searches."""
 
 LEAST_DESCENT = 0.05
 """Fall of log(error) a value, over two leaves, of plain trees on the way to a drawn picture; photographs give less."""
@@ -126,10 +121,9 @@ class DrawnSearch(Growth):
 
     def _is_photograph(self, leaders: list[Candidate], best: Candidate, curve: list[Candidate]) -> bool:
         """Do the plain words fall behind all words, twice in turn or by far, or do they explain too little?"""
-        patience = PATIENCE if "plain_environments" in self.families else 1.0
 
         def lag(leader: Candidate) -> float:
-            return leader.error / patience / min((rival.error for rival in curve if rival.values <= leader.values), default=math.inf)
+            return leader.error / min((rival.error for rival in curve if rival.values <= leader.values), default=math.inf)
 
         if len(leaders) > 1 and all(leader.values >= 12 and lag(leader) > LAGGING for leader in leaders[-2:]):
             return True
@@ -224,14 +218,10 @@ def looks_drawn(candidate: Candidate) -> bool:
     return candidate.error < (4.0 * DRAWN if has_edges(candidate.root) else DRAWN)
 
 
-def may_reflect(candidate: Candidate) -> bool:
-    """Has a tree that is not quite the picture hard edges, or is it so near, that an environment may be all it lacks?"""
-    return candidate.error > ROUNDING and (has_edges(candidate.root) or candidate.error < 1.5 * DRAWN)
-
-
-def has_edges(root: Node) -> bool:
-    """Has any leaf a hard edge?"""
-    return any(isinstance(node, Leaf) and is_hard(node) for _, node in walk(root))
+def has_edges(root: Node, softest: float = 0.0) -> bool:
+    """Has any leaf an edge no softer than this?"""
+    edges = (node for _, node in walk(root) if isinstance(node, Leaf) and any(p.name == "softness" for p in KINDS[node.kind].parameters))
+    return any(node["softness"][0] <= softest for node in edges)
 
 
 def settled(candidate: Candidate) -> float:

@@ -1,0 +1,53 @@
+"""The second pass of the search for drawn pictures: the words of the released grammar with its environments.
+
+An environment of broad lights explains a little of everything, so that a beam which has its word from the start loses
+toon trees. It comes second, only for pictures as clean as renderings, and gives up as soon as the trees with one do not
+lead: a tree with the right environment is never behind the best of all words, one of a photograph soon is.
+"""
+
+from __future__ import annotations
+
+import math
+
+from unshade.growth import Candidate, Effort, Samples
+from unshade.search_drawn import LAGGING, PLAIN, PLAIN_LIMITS, ROUNDING, DrawnSearch, has_edges
+
+REFLECTING = (*PLAIN, "plain_environments")
+"""All families of the released grammar."""
+
+NEARLY = 8.0e-5
+"""A tree without edges under this error may lack an environment only."""
+
+LEVEL = 1.05
+"""Where there are no edges to place, trees with the right environment are never this many times worse than others as large."""
+
+PLACED = 30
+"""Values by which the edges of a drawn picture are in place, so that its trees fall behind no more."""
+
+LEADING = 40
+"""Values from which on trees with the right environment leave all others behind."""
+
+
+class ReflectingSearch(DrawnSearch):
+    """`run` as in the first pass. ``is_edged``: has the picture edges?"""
+
+    def __init__(self, samples: Samples, effort: Effort, is_edged: bool) -> None:
+        super().__init__(samples, effort, REFLECTING)
+        self.is_edged = is_edged
+
+    def _is_photograph(self, leaders: list[Candidate], best: Candidate, curve: list[Candidate]) -> bool:
+        lag = best.error / min((rival.error for rival in curve if rival.values <= best.values), default=math.inf)
+        if self.is_edged and leaders[-1].values < PLACED:
+            return False
+        return lag > (LAGGING if self.is_edged else LEVEL) - 0.05 * max(0, best.values - LEADING)
+
+
+def is_edged(*candidates: Candidate | None) -> bool:
+    """Has any of some trees an edge as narrow as those of the released grammar?"""
+    narrow = PLAIN_LIMITS["softness"][1]
+    return any(candidate is not None and has_edges(candidate.root, narrow) for candidate in candidates)
+
+
+def may_reflect(candidate: Candidate, plain: Candidate | None) -> bool:
+    """Is a tree of a clean picture so near, or has it or the best plain tree edges, that an environment may be all it lacks?"""
+    return candidate.error > ROUNDING and (candidate.error < NEARLY or is_edged(candidate, plain))
