@@ -7,13 +7,14 @@ shading side by side, then settling it leaf by leaf with its edges hard, down to
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Generator, Iterator
 
 from unshade.changes import paints_as_shades, removals, swaps
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
 from unshade.fit.model import NO_LIMITS, Limits, Model, soften
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
-from unshade.moves import Anatomy, Proposer
+from unshade.moves import Anatomy, Proposer, plain_numbers
 from unshade.nodes import KINDS, Leaf, Node, count_values, find, walk
 
 PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots", "plain_rims")
@@ -39,6 +40,9 @@ HOPELESS = 4.0
 UNLIKE = 2.5e-4
 """A picture that was not drawn shows itself while the plain trees' error is over this one."""
 
+SHOWING = 16
+"""Values from which on a photograph shows itself."""
+
 LAGGING = 1.3
 """No drawn picture is twice in turn explained this many times worse by plain words than by all words in trees as large."""
 
@@ -50,6 +54,15 @@ MOST_DETOURS = 3
 
 TWINS = 0.02
 """Two trees of one form and size whose errors differ by less than this share are taken for one."""
+
+NEAR = 0.96
+"""Cosine of the angle within which two leaves of a kind end in one place."""
+
+BESIDE = 0.2
+"""Way within which two edges end in one place."""
+
+PLACES = frozenset({"threshold", "center", "width", "radius"})
+"""Parameters that say where an edge is."""
 
 PHOTOGRAPHIC = 1.0e-3
 """A plain tree over this error is given up: the picture was not drawn with one."""
@@ -81,7 +94,7 @@ class DrawnSearch(Growth):
             best, stale = (leader, 0) if self._drawn(leader) < self._drawn(best) else (best, stale + 1)
             yield "plain", best
             leaders.append(leader)
-            if leader.values >= 16 and self._is_photograph(leaders, best, curve):
+            if leader.values >= SHOWING and self._is_photograph(leaders, best, curve):
                 return None
         if best.error > UNLIKE:
             return None
@@ -204,11 +217,17 @@ class DrawnSearch(Growth):
     def _extended(self, states: list[Candidate], proposer: Proposer, families: tuple[str, ...], most: int, steps: int) -> list[Candidate]:
         """Every state with one leaf more, by short fits; only forms that the released grammar has."""
         options = []
+        seen: dict[tuple[str, ...], list[_Gist]] = {}
         for state in states:
             model = Model(state.root, self.samples.coarse)
             moves = proposer.propose(model, model.layout.pack(state.root), families, most)
             for root in [move.root for move in moves] + paints_as_shades(state.root):
-                if count_values(root) <= min(self.effort.max_values, LARGEST_DRAWN) and is_released(root):
+                if count_values(root) > min(self.effort.max_values, LARGEST_DRAWN) or not is_released(root):
+                    continue
+                gist = _gist(root)
+                alike = seen.setdefault(tuple(gist), [])
+                if not any(_resemble(gist, other) for other in alike):
+                    alike.append(gist)
                     options.append(self._coarse(root, steps))
         return options
 
@@ -275,6 +294,41 @@ def lineages(candidates: list[Candidate], each: int) -> list[Candidate]:
             line.append(candidate)
             chosen.append(candidate)
     return chosen
+
+
+_Gist = dict[str, list[tuple[tuple[float, ...], tuple[float, ...]]]]
+"""Where the leaves of each kind at each depth point, and where their edges are; nothing, for one colour."""
+
+
+def _gist(root: Node) -> _Gist:
+    gist: _Gist = {}
+    for address, node in walk(root):
+        if isinstance(node, Leaf):
+            held = list(zip(KINDS[node.kind].parameters, plain_numbers(node), strict=True))
+            points = next((numbers for parameter, numbers in held if parameter.type == "direction"), ())
+            edges = tuple(numbers[0] for parameter, numbers in held if parameter.name in PLACES)
+            gist.setdefault(f"{node.kind} {address.count('.')}", []).append((points, edges))
+    return dict(sorted(gist.items()))
+
+
+def _resemble(a: _Gist, b: _Gist) -> bool:
+    """Will two trees with leaves of the same kinds end as the same tree, since all their leaves lie nearly alike?"""
+    for kind, leaves in a.items():
+        left = list(b[kind])
+        for leaf in leaves:
+            match = next((k for k, other in enumerate(left) if _lie_alike(leaf, other)), None)
+            if match is None:
+                return False
+            del left[match]
+        if left:
+            return False
+    return True
+
+
+def _lie_alike(a: tuple[tuple[float, ...], tuple[float, ...]], b: tuple[tuple[float, ...], tuple[float, ...]]) -> bool:
+    if len(a[0]) != len(b[0]) or sum(map(operator.mul, a[0], b[0])) < NEAR * len(a[0]) / 3:
+        return False
+    return all(abs(x - y) < BESIDE for x, y in zip(a[1], b[1], strict=True))
 
 
 def _are_twins(a: Candidate, b: Candidate) -> bool:
