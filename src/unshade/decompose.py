@@ -56,7 +56,13 @@ PRESETS = {
     for preset in (
         Preset("draft", Effort(30, beam=0, trials=3, rounds=0, sweeps=0, polish_steps=10), 4000, 6, "at once, 30 values"),
         Preset("balanced", Effort(64), 8000, 10, "a second or two, 64 values"),
-        Preset("best", Effort(160, trials=5, rounds=4, polish_steps=30, late=True), 12000, 16, "several seconds, 160 values"),
+        Preset(
+            "best",
+            Effort(160, beam=2, beam_moves=5, trials=5, rounds=4, polish_steps=30, late=True),
+            12000,
+            16,
+            "several seconds, 160 values",
+        ),
     )
 }
 

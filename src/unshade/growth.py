@@ -33,9 +33,9 @@ class Effort:
     max_values: int
     price: float = 0.006
     """Least decrease of log(error) that a stored value must bring."""
-    beam: int = 2
+    beam: int = 1
     """Plain trees of every form that are kept while they grow; 0 leaves the plain search out."""
-    beam_moves: int = 5
+    beam_moves: int = 4
     """Ways in which each of them may grow on."""
     trials: int = 4
     """Moves that are tried by a short fit at each growth."""

@@ -7,6 +7,7 @@ lead: a tree with the right environment is never behind the best of all words, o
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 from unshade.growth import Candidate, Effort, Samples
@@ -28,10 +29,19 @@ LEADING = 40
 """Values from which on trees with the right environment leave all others behind."""
 
 
+WIDTH = 2
+"""Trees of every form that are kept, at least, where there are edges: an environment is seen late, after all that is on top of it."""
+
+MOVES = 5
+"""Ways in which each may grow on, at least."""
+
+
 class ReflectingSearch(DrawnSearch):
     """`run` as in the first pass. ``is_edged``: has the picture edges?"""
 
     def __init__(self, samples: Samples, effort: Effort, is_edged: bool) -> None:
+        if is_edged:
+            effort = dataclasses.replace(effort, beam=max(WIDTH, effort.beam), beam_moves=max(MOVES, effort.beam_moves))
         super().__init__(samples, effort, REFLECTING)
         self.is_edged = is_edged
 
