@@ -22,11 +22,8 @@ NEARLY = 8.0e-5
 LEVEL = 1.05
 """Where there are no edges to place, trees with the right environment are never this many times worse than others as large."""
 
-PLACED = 30
-"""Values by which the edges of a drawn picture are in place, so that its trees fall behind no more."""
-
 LEADING = 40
-"""Values from which on trees with the right environment leave all others behind."""
+"""Values by which the edges of a drawn picture are in place; from here on trees with the right environment leave all others behind."""
 
 
 WIDTH = 2
@@ -47,7 +44,7 @@ class ReflectingSearch(DrawnSearch):
 
     def _is_photograph(self, leaders: list[Candidate], best: Candidate, curve: list[Candidate]) -> bool:
         lag = best.error / min((rival.error for rival in curve if rival.values <= best.values), default=math.inf)
-        if self.is_edged and leaders[-1].values < PLACED:
+        if self.is_edged and leaders[-1].values < LEADING:
             return False
         return lag > (LAGGING if self.is_edged else LEVEL) - 0.05 * max(0, best.values - LEADING)
 
