@@ -252,6 +252,15 @@ def test_swaps_are_other_trees() -> None:
         assert exchanged, f"no {lost} becomes a {gained}"
 
 
+def test_an_environment_behind_the_sphere_may_be_a_rim() -> None:
+    behind = leaf("environment", direction=(0.7, -0.2, -0.7, 0.0, 0.0, 1.0), sharpness=(3.0, 5.0), color=(0.5, 0.5, 0.5, 0.1, 0.2, 0.3))
+    rims = [node for root in swaps(screen(multiply(A, FORM), behind)) for _, node in walk(root) if node.kind == "rim"]
+    assert len(rims) == 1
+    (rim,) = rims
+    assert isinstance(rim, Leaf)
+    assert rim["direction"][0] > 0.9 > abs(rim["direction"][1])
+
+
 def test_a_swap_looks_alike() -> None:
     """A swap is a start for a fit: the same light in the same place, about as large and as bright."""
     normals = sphere_normals(48)

@@ -111,6 +111,13 @@ def _as_stripe(root: Node, address: str, node: Node) -> list[Node]:
     return found
 
 
+def _as_rims(environment: Leaf) -> list[Leaf]:
+    """What lights of an environment that show at the silhouette look like: a rim on their side."""
+    directions = environment["direction"]
+    sides = [directions[3 * k : 3 * k + 2] for k in range(environment.lobes)]
+    return [leaf("rim", direction=(x, y, 0.2), exponent=1.0) for x, y in sides if math.hypot(x, y) > 0.1]
+
+
 def _brightness(paint: Node) -> float:
     """Mean of the channels of a paint's colours."""
     colors = [node["color"] for _, node in walk(paint) if isinstance(node, Leaf) and node.kind == "albedo"]
@@ -146,5 +153,7 @@ def _relatives(node: Leaf) -> list[Leaf]:
             if abs(edge) >= 0.9:
                 return []
             return [leaf("stripe", direction=direction, center=min(edge + 0.5, 1.0), width=1.0, softness=node["softness"][0])]
+        case "environment":
+            return _as_rims(node)
         case _:
             return []
