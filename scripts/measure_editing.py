@@ -1,6 +1,6 @@
 """Measure what editing a recovered tree is worth: edits, relighting, analogies and edit scripts on trees drawn by the sampler.
 
-    python scripts/measure_editing.py [--fresh] [--trees 20] [--cases 20]
+    python scripts/measure_editing.py [--fresh] [--trees 20] [--cases 20] [--seed 7000003]
 
 Known trees are drawn, rendered to 8 bits and decomposed (balanced; kept in out/editing until --fresh). Then
 
@@ -9,7 +9,8 @@ Known trees are drawn, rendered to 8 bits and decomposed (balanced; kept in out/
 - analogy: AB is made from the known trees of A and B with code of its own here, and understood from the pictures;
 - script: one edit script on 100 trees, timed.
 
-Writes benchmarks/results/editing/*.json, every case with its figure. Trees with an environment are counted apart as well.
+Writes benchmarks/results/editing/*.json (those of another seed in a folder of their own), every case with its figure. Trees with an
+environment are counted apart as well.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from unshade.transfer import transfer
 ROOT = Path(__file__).resolve().parent.parent
 KEPT, RESULTS = ROOT / "out" / "editing", ROOT / "benchmarks" / "results" / "editing"
 NORMALS = sphere_normals(SIZE)
+FIRST_SEED = 7_000_003
 PAIRS = 36
 DEGREES = 30.0
 CEILING = 100.0
@@ -84,13 +86,13 @@ class Known:
         return bool(same_structure(self.found, self.truth))
 
 
-def known_trees(count: int, fresh: bool) -> list[Known]:
+def known_trees(count: int, fresh: bool, seed: int = FIRST_SEED) -> list[Known]:
     """Two of three realistic, one in three toon; half of the realistic ones may hold an environment."""
     KEPT.mkdir(parents=True, exist_ok=True)
     found = []
     for number in range(count):
         style = "toon" if number % 3 == 2 else "realistic"
-        generator = torch.Generator().manual_seed(7_000_003 + number)
+        generator = torch.Generator().manual_seed(seed + number)
         truth = sample(generator, style, environment=None if style == "realistic" and number % 2 else False)
         image = (render(truth, NORMALS) * 255.0).round() / 255.0
         key = hashlib.sha256(str(truth).encode()).hexdigest()[:16]
@@ -265,9 +267,9 @@ def _judged(rows: list[dict[str, Any]]) -> dict[str, float]:
     return {"right": round(sum(row["right"] for row in rows) / len(rows), 3), **spread([row["psnr"] for row in rows], 40.0)}
 
 
-def write(name: str, document: dict[str, Any]) -> None:
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / f"{name}.json").write_text(
+def write(folder: Path, name: str, document: dict[str, Any]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.json").write_text(
         json.dumps({"machine": machine(), "versions": versions(), **document}, indent=1) + "\n", encoding="utf-8"
     )
     print(name, json.dumps(document["summary"]), flush=True)
@@ -278,9 +280,11 @@ def main() -> None:
     parser.add_argument("--fresh", action="store_true", help="decompose again")
     parser.add_argument("--trees", type=int, default=20)
     parser.add_argument("--cases", type=int, default=20, help="analogies a component")
+    parser.add_argument("--seed", type=int, default=FIRST_SEED, help="of the trees that are drawn")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    known = known_trees(given.trees, given.fresh)
+    known = known_trees(given.trees, given.fresh, given.seed)
+    folder = RESULTS if given.seed == FIRST_SEED else RESULTS / f"seed-{given.seed}"
     hard = {one.name for one in known if one.has_environment}
     about = [
         {
@@ -293,9 +297,9 @@ def main() -> None:
         for one in known
     ]
     edits = measure_edits(known)
-    write("edits", {"summary": summed(edits, 38.0, hard), "trees": about, "cases": edits})
+    write(folder, "edits", {"summary": summed(edits, 38.0, hard), "trees": about, "cases": edits})
     lit = measure_relighting(known)
-    write("relight", {"summary": summed(lit, 36.0, hard), "cases": lit})
+    write(folder, "relight", {"summary": summed(lit, 36.0, hard), "cases": lit})
     rows = measure_analogies(known, given.cases)
     summary = {}
     for which in [None, *Component]:
@@ -303,8 +307,8 @@ def main() -> None:
         summary[which.value if which else "all"] = _judged(own)
         if any(not row["environment"] for row in own):
             summary[f"{which.value if which else 'all'}, without environment"] = _judged([row for row in own if not row["environment"]])
-    write("analogy", {"summary": summary, "cases": rows})
-    write("script", {"summary": measure_script(known)})
+    write(folder, "analogy", {"summary": summary, "cases": rows})
+    write(folder, "script", {"summary": measure_script(known)})
 
 
 if __name__ == "__main__":
