@@ -71,6 +71,7 @@ def place() -> Iterator[Place]:
     torch.distributed.init_process_group("nccl" if gpu else "gloo")
     try:
         yield Place(torch.distributed.get_rank(), processes, device)
+        torch.distributed.barrier()  # none may leave while another still talks to it
     finally:
         torch.distributed.destroy_process_group()
 
