@@ -102,6 +102,16 @@ def by_krita(path: Path) -> np.ndarray:
     raise AssertionError(f"Krita wrote nothing in {STARTS} starts, and ended with {done.returncode}: {done.stderr.decode()[-2000:]}")
 
 
+def by_inkscape(paths: Sequence[Path], size: int) -> list[np.ndarray]:
+    """What Inkscape exports of SVG files."""
+    if shutil.which("inkscape") is None:
+        pytest.skip("needs Inkscape (apt-get install inkscape)")
+    edges = [f"--export-width={size}", f"--export-height={size}", "--export-area-page"]
+    command = ["inkscape", "--export-type=png", *edges, *map(str, paths)]
+    subprocess.run(command, env={**os.environ, "HOME": str(paths[0].parent)}, capture_output=True, timeout=240, check=True)
+    return [decoded(path.with_suffix(".png")) for path in paths]
+
+
 def by_chromium(browser: str, folder: Path, parts: Sequence[str], size: int, head: str = "") -> list[np.ndarray]:
     """What Chromium shows of pieces of HTML, each in a square of ``size`` pixels; all on one page."""
     columns = min(COLUMNS, len(parts))

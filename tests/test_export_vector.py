@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from export_trees import LEAVES, MASKS, PARAMETRIC, SRGB, TREES
-from renderers import by_chromium, by_pdfium, by_poppler, by_resvg, expected, psnr, rendered
+from renderers import by_chromium, by_inkscape, by_pdfium, by_poppler, by_resvg, expected, psnr, rendered
 from unshade.errors import PictureError
 from unshade.export import ExportWarning, export
 from unshade.export.css import STYLE, div
@@ -71,6 +71,16 @@ def test_numbers_are_short() -> None:
 @pytest.mark.parametrize("name", SRGB)
 def test_svg_in_resvg(name: str) -> None:
     assert psnr(by_resvg(svg(TREES[name]), 256), expected(TREES[name], 256)) >= NEAR
+
+
+@pytest.mark.slow
+def test_svg_in_inkscape(tmp_path: Path) -> None:
+    names = ["mix-stripe", "mix-in-mix", "leaf-toon_diffuse-hard", "screen"]
+    for name in names:
+        (tmp_path / f"{name}.svg").write_text(svg(TREES[name]), encoding="utf-8")
+    shown = by_inkscape([tmp_path / f"{name}.svg" for name in names], 256)
+    found = {name: psnr(picture, expected(TREES[name], 256)) for name, picture in zip(names, shown, strict=True)}
+    assert min(found.values()) >= NEAR, found
 
 
 @pytest.mark.parametrize("name", PARAMETRIC)
