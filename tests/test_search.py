@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given, settings
 
 import strategies
 from unshade.atoms import FAMILIES, Dictionary, directions
+from unshade.beam import Seen
 from unshade.changes import removals, swaps
 from unshade.fit.least_squares import error_of, fit_pixels
 from unshade.fit.model import Model
 from unshade.fit.pixels import Pixels
 from unshade.grammar import validate
-from unshade.growth import Candidate, Front
+from unshade.growth import Candidate, Effort, Front, Samples
 from unshade.moves import Anatomy, Move, Proposer, add_light, add_shade, complement, is_paint, recolored
 from unshade.nodes import MAX_NODES, Leaf, Node, count_values, find, leaf, mix, multiply, screen, walk
 from unshade.render import render
+from unshade.search_reflecting import ReflectingSearch
 from unshade.sphere import sphere_normals
 
 A, B, C = (leaf("albedo", color=color) for color in ((0.5, 0.3, 0.2), (0.15, 0.25, 0.5), (0.3, 0.6, 0.3)))
@@ -259,6 +263,40 @@ def test_an_environment_behind_the_sphere_may_be_a_rim() -> None:
     (rim,) = rims
     assert isinstance(rim, Leaf)
     assert rim["direction"][0] > 0.9 > abs(rim["direction"][1])
+
+
+def test_a_tree_that_will_end_as_another_is_not_new() -> None:
+    other = LIGHT.set(direction=(-0.6, 0.2, 0.7))
+    near = LIGHT.set(direction=(0.35, 0.45, 0.8), sharpness=60.0)
+    seen = Seen()
+    assert seen.is_new(screen(A, LIGHT, other))
+    assert not seen.is_new(screen(B, other, near)), "colours and the order of lights do not matter"
+    assert seen.is_new(screen(A, LIGHT)), "a light less"
+    assert seen.is_new(screen(A, LIGHT, LIGHT)), "both lights in one place"
+    assert seen.is_new(mix(A, B, HALF))
+    assert not seen.is_new(mix(A, B, HALF.set(threshold=0.2)))
+    assert seen.is_new(mix(A, B, HALF.set(threshold=-0.4))), "an edge in another place"
+    assert seen.is_new(mix(A, B, BAND)), "another mask"
+
+
+@pytest.mark.parametrize(
+    ("edged", "size", "lag", "given_up"),
+    [
+        (False, 20, 1.0, False),
+        (False, 20, 1.2, True),
+        (True, 20, 2.0, False),
+        (True, 44, 1.0, False),
+        (True, 44, 2.0, True),
+        (True, 56, 0.7, True),
+    ],
+)
+def test_the_second_pass_gives_up_once_it_does_not_lead(edged: bool, size: int, lag: float, given_up: bool, monkeypatch: Any) -> None:
+    pixels = small_pixels(A)
+    dictionary = Dictionary(pixels.normals)
+    search = ReflectingSearch(Samples(pixels, pixels, pixels, dictionary, dictionary), Effort(64), edged)
+    monkeypatch.setattr(Candidate, "values", property(lambda candidate: size))
+    leader, rival = Candidate(A, lag * 1e-3), Candidate(B, 1e-3)
+    assert search._is_photograph([leader], leader, [rival]) is given_up
 
 
 def test_a_swap_looks_alike() -> None:

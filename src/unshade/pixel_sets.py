@@ -16,7 +16,7 @@ POINTS = 2500
 """Points of the full picture on which trees grow once they are good."""
 
 CLEAN = 1.2
-"""Grain of the cleanest pictures: 1.0 is what rounding to 8 bits makes. Photographs have 1.5 and more, and so has JPEG."""
+"""Most grain of a clean picture. Rounding to 8 bits makes 1.0; most MatCaps have 1.5 and more, and so have JPEGs that are not flat."""
 
 
 def samples_of(sphere: SphereImage, fine: int, seed: int) -> Samples:

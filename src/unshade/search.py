@@ -39,24 +39,23 @@ class Search(Growth):
         current = Candidate(self.start(), math.inf)
         for current in self.grow(current, self.samples.coarse, self.samples.coarse_dictionary, 1e-4, self.early):
             yield "grow", current
-        may_be_drawn = bool(self.effort.beam) and self.complete
-        plain: Candidate | None = None
-        if may_be_drawn:
-            drawn = DrawnSearch(self.samples, self.effort)
-            plain = yield from drawn.run(self.rough.members())
-            self.front.update(drawn.front)
-            self.rough.update(drawn.rough)
-        if plain is not None and plain.error < DRAWN:
-            current = plain
-        else:
-            current = yield from self._grown(current)
-        if may_be_drawn and self.samples.is_clean and may_reflect(current, plain):
-            current = yield from self._with_environment(current, plain)
-        if may_be_drawn and current is not plain and looks_drawn(current):
-            current = DrawnSearch(self.samples, self.effort).prune(current)
-        if plain and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
-            current = plain
+        current = yield from (self._drawn_or_grown if self.effort.beam and self.complete else self._grown)(current)
         yield "polish", current
+
+    def _drawn_or_grown(self, current: Candidate) -> Generator[tuple[str, Candidate], None, Candidate]:
+        """The tree that the picture was drawn with, or the one grown on in all words, whichever is better."""
+        drawn = DrawnSearch(self.samples, self.effort)
+        plain = yield from drawn.run(self.rough.members())
+        self.front.update(drawn.front)
+        self.rough.update(drawn.rough)
+        current = plain if plain is not None and plain.error < DRAWN else (yield from self._grown(current))
+        if self.samples.is_clean and may_reflect(current, plain):
+            current = yield from self._with_environment(current, plain)
+        if current is not plain and looks_drawn(current):
+            current = drawn.prune(current)
+        if plain is not None and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
+            current = plain
+        return current
 
     def _grown(self, current: Candidate) -> Generator[tuple[str, Candidate], None, Candidate]:
         """The tree grown on in all words and points of the full picture, with leaves of other kinds and in other places, sharp."""

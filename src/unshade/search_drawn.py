@@ -7,15 +7,15 @@ shading side by side, then settling it leaf by leaf with its edges hard, down to
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Generator, Iterator
 
+from unshade.beam import Seen, is_released, lineages
 from unshade.changes import paints_as_shades, removals, swaps
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
-from unshade.fit.model import NO_LIMITS, Limits, Model, soften
+from unshade.fit.model import NO_LIMITS, Limits, Model, soften, softness_of
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
-from unshade.moves import Anatomy, Proposer, plain_numbers
-from unshade.nodes import KINDS, Leaf, Node, count_values, find, walk
+from unshade.moves import Proposer
+from unshade.nodes import Leaf, Node, count_values, walk
 
 PLAIN = ("plain_lights", "plain_masks", "plain_shades", "plain_spots", "plain_rims")
 """The families of the released grammar without its environments: all lights grey, edges drawn."""
@@ -34,9 +34,6 @@ LARGEST_DRAWN = 56
 SETTLED = 5.0e-4
 """Only a plain tree under this error is worth settling leaf by leaf."""
 
-HOPELESS = 4.0
-"""A form whose trees have this many times the error of the best is left behind."""
-
 UNLIKE = 2.5e-4
 """A picture that was not drawn shows itself while the plain trees' error is over this one."""
 
@@ -44,25 +41,13 @@ SHOWING = 16
 """Values from which on a photograph shows itself."""
 
 LAGGING = 1.3
-"""No drawn picture is twice in turn explained this many times worse by plain words than by all words in trees as large."""
+"""Hardly any drawn picture is twice in turn explained this many times worse by plain words than by all words in trees as large."""
 
 LEAST_DESCENT = 0.05
 """Fall of log(error) a value, over two leaves, of plain trees on the way to a drawn picture; photographs give less."""
 
 MOST_DETOURS = 3
 """Leaves that are taken from a plain tree whose error stays where it was: its edges will not fall into place either."""
-
-TWINS = 0.02
-"""Two trees of one form and size whose errors differ by less than this share are taken for one."""
-
-NEAR = 0.96
-"""Cosine of the angle within which two leaves of a kind end in one place."""
-
-BESIDE = 0.2
-"""Way within which two edges end in one place."""
-
-PLACES = frozenset({"threshold", "center", "width", "radius"})
-"""Parameters that say where an edge is."""
 
 PHOTOGRAPHIC = 1.0e-3
 """A plain tree over this error is given up: the picture was not drawn with one."""
@@ -216,18 +201,12 @@ class DrawnSearch(Growth):
 
     def _extended(self, states: list[Candidate], proposer: Proposer, families: tuple[str, ...], most: int, steps: int) -> list[Candidate]:
         """Every state with one leaf more, by short fits; only forms that the released grammar has."""
-        options = []
-        seen: dict[tuple[str, ...], list[_Gist]] = {}
+        options, seen = [], Seen()
         for state in states:
             model = Model(state.root, self.samples.coarse)
             moves = proposer.propose(model, model.layout.pack(state.root), families, most)
             for root in [move.root for move in moves] + paints_as_shades(state.root):
-                if count_values(root) > min(self.effort.max_values, LARGEST_DRAWN) or not is_released(root):
-                    continue
-                gist = _gist(root)
-                alike = seen.setdefault(tuple(gist), [])
-                if not any(_resemble(gist, other) for other in alike):
-                    alike.append(gist)
+                if count_values(root) <= min(self.effort.max_values, LARGEST_DRAWN) and is_released(root) and seen.is_new(root):
                     options.append(self._coarse(root, steps))
         return options
 
@@ -239,36 +218,12 @@ def looks_drawn(candidate: Candidate) -> bool:
 
 def has_edges(root: Node, softest: float = 0.0) -> bool:
     """Has any leaf an edge no softer than this?"""
-    edges = (node for _, node in walk(root) if isinstance(node, Leaf) and any(p.name == "softness" for p in KINDS[node.kind].parameters))
-    return any(node["softness"][0] <= softest for node in edges)
+    return any(isinstance(node, Leaf) and softness_of(node) <= softest for _, node in walk(root))
 
 
 def settled(candidate: Candidate) -> float:
     """How a nearly right drawn tree is judged: a leaf that shows lowers this by 1 or more, one that mends a few pixels does not."""
     return math.log(max(candidate.error, 6.0e-6) + 3.0e-5) + 0.03 * candidate.values
-
-
-RELEASED_FORMS = {(), ("diffuse",), ("toon_diffuse",), ("toon_diffuse", "toon_diffuse")}
-"""Shadings of a base in the released grammar; one toon shading alone is on the way to two."""
-
-
-MOST_MIXES = 3
-"""Mixes in a plain tree: two in the released grammar, and one detour."""
-
-
-def is_released(root: Node) -> bool:
-    """Can a tree of the released grammar grow from this one?"""
-    return form_of(root) in RELEASED_FORMS and sum(node.kind == "mix" for _, node in walk(root)) <= MOST_MIXES
-
-
-def form_of(root: Node) -> tuple[str, ...]:
-    """The kinds of a base's shadings."""
-    return tuple(find(root, address).kind for address in Anatomy.of(root).forms)
-
-
-def line_of(root: Node) -> tuple[str, ...]:
-    """What tells the lines of a beam apart: the form, and whether there is a rim or an environment."""
-    return (*form_of(root), *sorted({node.kind for _, node in walk(root)} & {"rim", "environment"}))
 
 
 def _is_stuck(leaders: list[Candidate]) -> bool:
@@ -277,59 +232,3 @@ def _is_stuck(leaders: list[Candidate]) -> bool:
         return False
     before, now = leaders[-3], leaders[-1]
     return math.log(before.error / max(now.error, FLOOR)) < LEAST_DESCENT * (now.values - before.values)
-
-
-def lineages(candidates: list[Candidate], each: int) -> list[Candidate]:
-    """The first candidates of every form, so that a wrong shading that fits well early cannot crowd out the right one.
-
-    A form that is `HOPELESS` times worse than the best is left behind, and so is a tree as large and as good as one before
-    it, which is nearly always the same tree.
-    """
-    bar = HOPELESS * min((candidate.error for candidate in candidates), default=0.0)
-    lines: dict[tuple[str, ...], list[Candidate]] = {}
-    chosen = []
-    for candidate in candidates:
-        line = lines.setdefault(line_of(candidate.root), [])
-        if len(line) < each and candidate.error <= bar and not any(_are_twins(candidate, other) for other in line):
-            line.append(candidate)
-            chosen.append(candidate)
-    return chosen
-
-
-_Gist = dict[str, list[tuple[tuple[float, ...], tuple[float, ...]]]]
-"""Where the leaves of each kind at each depth point, and where their edges are; nothing, for one colour."""
-
-
-def _gist(root: Node) -> _Gist:
-    gist: _Gist = {}
-    for address, node in walk(root):
-        if isinstance(node, Leaf):
-            held = list(zip(KINDS[node.kind].parameters, plain_numbers(node), strict=True))
-            points = next((numbers for parameter, numbers in held if parameter.type == "direction"), ())
-            edges = tuple(numbers[0] for parameter, numbers in held if parameter.name in PLACES)
-            gist.setdefault(f"{node.kind} {address.count('.')}", []).append((points, edges))
-    return dict(sorted(gist.items()))
-
-
-def _resemble(a: _Gist, b: _Gist) -> bool:
-    """Will two trees with leaves of the same kinds end as the same tree, since all their leaves lie nearly alike?"""
-    for kind, leaves in a.items():
-        left = list(b[kind])
-        for leaf in leaves:
-            match = next((k for k, other in enumerate(left) if _lie_alike(leaf, other)), None)
-            if match is None:
-                return False
-            del left[match]
-        if left:
-            return False
-    return True
-
-
-def _lie_alike(a: tuple[tuple[float, ...], tuple[float, ...]], b: tuple[tuple[float, ...], tuple[float, ...]]) -> bool:
-    if len(a[0]) != len(b[0]) or sum(map(operator.mul, a[0], b[0])) < NEAR * len(a[0]) / 3:
-        return False
-    return all(abs(x - y) < BESIDE for x, y in zip(a[1], b[1], strict=True))
-
-
-def _are_twins(a: Candidate, b: Candidate) -> bool:
-    return a.values == b.values and abs(a.error - b.error) <= TWINS * b.error

@@ -2,7 +2,7 @@
 
 An environment of broad lights explains a little of everything, so that a beam which has its word from the start loses
 toon trees. It comes second, only for pictures as clean as renderings, and gives up as soon as the trees with one do not
-lead: a tree with the right environment is never behind the best of all words, one of a photograph soon is.
+lead: a tree with the right environment is hardly ever behind the best of all words, one of a photograph soon is.
 """
 
 from __future__ import annotations
@@ -20,11 +20,10 @@ NEARLY = 8.0e-5
 """A tree without edges under this error may lack an environment only."""
 
 LEVEL = 1.05
-"""Where there are no edges to place, trees with the right environment are never this many times worse than others as large."""
+"""Where there are no edges to place, trees with the right environment are hardly ever this many times worse than others as large."""
 
 LEADING = 40
 """Values by which the edges of a drawn picture are in place; from here on trees with the right environment leave all others behind."""
-
 
 WIDTH = 2
 """Trees of every form that are kept, at least, where there are edges: an environment is seen late, after all that is on top of it."""

@@ -12,7 +12,7 @@ from collections.abc import Collection
 import torch
 
 from unshade.fit.fitted import Fitted
-from unshade.fit.model import EDGE, NO_LIMITS, Limits, Model, is_hard, is_locked, soften
+from unshade.fit.model import EDGE, NO_LIMITS, Limits, Model, is_hard, is_locked, soften, softness_of
 from unshade.fit.pixels import Pixels
 from unshade.nodes import KINDS, Leaf, Node, replace, walk
 from unshade.types import Image, Mask
@@ -113,12 +113,7 @@ def sharpen(pixels: Pixels, root: Node, *, locked: Collection[str] = (), steps: 
     fitted = fit_pixels(pixels, soften(root, FINE_SOFTNESS, locked), locked=locked, steps=steps, softest=FINE_SOFTNESS, limits=limits)
     root, error = fitted.root, fitted.error
     for address, node in walk(fitted.root):
-        if (
-            isinstance(node, Leaf)
-            and any(p.name == "softness" for p in KINDS[node.kind].parameters)
-            and node["softness"][0] < 2.0 * FINE_SOFTNESS
-            and not is_locked(address, "softness", locked)
-        ):
+        if isinstance(node, Leaf) and softness_of(node) < 2.0 * FINE_SOFTNESS and not is_locked(address, "softness", locked):
             hard = replace(root, address, node.set(softness=0.0))
             hard_error = error_of(pixels, hard)
             if hard_error < error:

@@ -31,9 +31,14 @@ EDGE = ("direction", "threshold", "center", "width", "radius", "softness")
 """Parameters that place an edge. A hard edge has no slope, so a fit leaves its place alone; `soften` it to move it."""
 
 
+def softness_of(leaf: Leaf) -> float:
+    """Width of the edge of a mask or a toon leaf; infinite for a leaf without one."""
+    return leaf["softness"][0] if any(parameter.name == "softness" for parameter in KINDS[leaf.kind].parameters) else math.inf
+
+
 def is_hard(leaf: Leaf) -> bool:
     """True for a mask or a toon leaf whose edge is a step."""
-    return any(parameter.name == "softness" for parameter in KINDS[leaf.kind].parameters) and leaf["softness"] == (0.0,)
+    return softness_of(leaf) == 0.0
 
 
 def is_locked(address: str, parameter: str, locked: Collection[str]) -> bool:
