@@ -107,6 +107,11 @@ def by_resvg(path: Path) -> Drawn:
     return picture, f"resvg {resvg_py.__resvg_version__}"
 
 
+def by_inkscape(path: Path) -> Drawn:
+    [picture] = of.by_inkscape([path], SIZE)
+    return picture, f"Inkscape {said('inkscape', '--version')}"
+
+
 def by_pdfium(path: Path) -> Drawn:
     picture = of.by_pdfium(path, SIZE)
     import pypdfium2
@@ -179,6 +184,7 @@ DRAWINGS = (
     Drawing("png", "Blender", by_matcap, options=SQUARE, remark="as a MatCap on a mesh"),
     Drawing("svg", "Chromium", by_page),
     Drawing("svg", "resvg", by_resvg),
+    Drawing("svg", "Inkscape", by_inkscape),
     Drawing("pdf", "PDFium", by_pdfium, remark=CORNERS),
     Drawing("pdf", "Poppler", by_poppler, remark=CORNERS),
     Drawing("css", "Chromium", by_page, options=PIXELS),

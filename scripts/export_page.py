@@ -52,9 +52,8 @@ stretched to the smallest ellipse around the path with the proportions of its bo
 ellipsoid that it is cut out of, not of the path blown up.
 
 The groups of an SVG carry the nodes' addresses as `id` and their names as `inkscape:label`; a PDF has a layer for each node. Blend
-modes work on encoded values in all three formats. Inkscape 1.2 draws the fixture trees that work on encoded values
-at 49 dB and more (256 pixels) and a balanced tree at 50.6 dB (512), measured once by hand; a test looks at four of them
-where Inkscape is installed. Illustrator has not been tried.
+modes work on encoded values in all three formats. The tests look at the groups that Inkscape finds, and at four pictures that it draws;
+Illustrator has not been tried.
 
 """
 

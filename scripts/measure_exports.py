@@ -26,7 +26,19 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
 from export_trees import SRGB, TREES  # noqa: E402
-from renderers import by_chromium, by_pdfium, by_poppler, by_psd_tools, by_pyora, by_resvg, expected, psnr, rendered, scored  # noqa: E402
+from renderers import (  # noqa: E402
+    by_chromium,
+    by_inkscape,
+    by_pdfium,
+    by_poppler,
+    by_psd_tools,
+    by_pyora,
+    by_resvg,
+    expected,
+    psnr,
+    rendered,
+    scored,
+)
 
 RESULT = ROOT / "benchmarks" / "results" / "export.json"
 SMALL, SIZES = 256, (512, 2048)
@@ -48,10 +60,13 @@ def vectors(folder: Path, browser: str | None) -> dict[str, dict[str, float]]:
     write_pdf(balanced, folder / "balanced.pdf")
     if shutil.which("pdftoppm"):
         found["pdf in Poppler"] = {}
+    for name, text in drawn.items():
+        (folder / f"{name}.svg").write_text(text, encoding="utf-8")
+    if shutil.which("inkscape"):
+        shown = by_inkscape([folder / f"{name}.svg" for name in SRGB], SMALL)
+        found["svg in Inkscape"] = {"lowest": min(psnr(one, wanted[name]) for one, name in zip(shown, SRGB, strict=True))}
     if browser:
         found |= {"svg in Chromium": {}, "css in Chromium": {}}
-        for name, text in drawn.items():
-            (folder / f"{name}.svg").write_text(text, encoding="utf-8")
         for target, parts, head in (
             ("svg", [f'<img src="{name}.svg">' for name in SRGB], ""),
             ("css", [div(tree, SMALL) for tree in SRGB.values()], f"<style>{STYLE}</style>"),
@@ -63,6 +78,8 @@ def vectors(folder: Path, browser: str | None) -> dict[str, dict[str, float]]:
         pictures = {"svg in resvg": by_resvg(svg(balanced, size), size), "pdf in PDFium": by_pdfium(folder / "balanced.pdf", size)}
         if "pdf in Poppler" in found:
             pictures["pdf in Poppler"] = by_poppler(folder / "balanced.pdf", size)
+        if "svg in Inkscape" in found:
+            [pictures["svg in Inkscape"]] = by_inkscape([folder / "balanced.svg"], size)
         if browser:
             image = f'<img src="balanced.svg" width="{size}" height="{size}">'
             pictures["svg in Chromium"] = by_chromium(browser, folder, [image], size)[0]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
+import subprocess
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -11,6 +14,7 @@ import pytest
 
 from export_trees import LEAVES, MASKS, PARAMETRIC, SRGB, TREES
 from renderers import by_chromium, by_inkscape, by_pdfium, by_poppler, by_resvg, expected, psnr, rendered
+from unshade.edit import remove
 from unshade.errors import PictureError
 from unshade.export import ExportWarning, export
 from unshade.export.css import STYLE, div
@@ -81,6 +85,23 @@ def test_svg_in_inkscape(tmp_path: Path) -> None:
     shown = by_inkscape([tmp_path / f"{name}.svg" for name in names], 256)
     found = {name: psnr(picture, expected(TREES[name], 256)) for name, picture in zip(names, shown, strict=True)}
     assert min(found.values()) >= NEAR, found
+
+
+@pytest.mark.slow
+def test_inkscape_edits_the_nodes(tmp_path: Path) -> None:
+    if shutil.which("inkscape") is None:
+        pytest.skip("needs Inkscape (apt-get install inkscape)")
+    tree = TREES["screen"]
+    light = next(address for address, node in tree.walk() if node.kind == "highlight")
+    (tmp_path / "tree.svg").write_text(svg(tree, 256), encoding="utf-8")
+    actions = f"select-by-id:{light};delete;export-filename:{tmp_path / 'less.svg'};export-plain-svg;export-do"
+    environment = {**os.environ, "HOME": str(tmp_path)}
+    command = ["inkscape", f"--actions={actions}", str(tmp_path / "tree.svg")]
+    subprocess.run(command, env=environment, capture_output=True, timeout=240, check=True)
+    left = {group.get("id") for group in ElementTree.parse(tmp_path / "less.svg").iter(f"{SVG}g")}
+    assert {address for address, _ in tree.walk()} - left == {light}
+    [shown] = by_inkscape([tmp_path / "less.svg"], 256)
+    assert psnr(shown, expected(remove(tree, light), 256)) >= NEAR
 
 
 @pytest.mark.parametrize("name", PARAMETRIC)

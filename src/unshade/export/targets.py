@@ -140,7 +140,7 @@ TARGETS = {
             "vector art: gradients, paths, masks and blend modes in groups named as the nodes",
             "svg.write_svg",
             (EMBEDDED, ENCODED),
-            "Chromium and resvg",
+            "Chromium, resvg and Inkscape 1.2",
             ("size", "shape", "region"),
             needs="svgelements (for a shape)",
         ),
