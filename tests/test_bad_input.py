@@ -161,6 +161,66 @@ def test_a_folder_without_permission(tmp_path: Path, fails: Fails) -> None:
     assert "no permission" in fails(OUTPUT, "decompose", tmp_path / "ball.png", "-o", locked / "out")
 
 
+def test_a_protected_file_stays(tmp_path: Path, fails: Fails) -> None:
+    for name, command in {
+        "a.png": ["render", RED],
+        "a.json": ["edit", RED, "--recolor", "teal"],
+        "a.svg": ["export", RED],
+        "a.gif": ["relight", RED, "--frames", 2, "--size", 16],
+    }.items():
+        (tmp_path / name).write_text("mine")
+        (tmp_path / name).chmod(0o444)
+        option = "--turntable" if name == "a.gif" else "-o"
+        assert "write-protected" in fails(OUTPUT, *command, option, tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["apply", RED, "--normals", "normals.png", "-o", "normals.png"],
+        ["apply", RED, "--from", RED, "--normals", "normals.png", "--photo", "photo.png", "-o", "photo.png"],
+        ["apply", RED, "--drawing", "d.svg", "--region", "a", "-o", "d.svg"],
+        ["render", RED, "--normals", "normals.png", "-o", "normals.png"],
+        ["export", RED, "--shape", "d.svg", "-o", "d.svg"],
+        ["relight", RED, "--environment", "sky.png", "--render", "sky.png"],
+        ["edit", "tree.json", "--recolor", "teal", "-o", "tree.json"],
+        ["extract", "out/matcap.png", "-o", "out"],
+        ["extract", "photo.png", "--normals", "normals.png", "-o", "."],
+    ],
+)
+def test_what_is_read_is_kept(command: list[str], tmp_path: Path, fails: Fails, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "extract.json").write_text("{}")
+    for name in ("photo.png", "normals.png", "sky.png", "out/matcap.png"):
+        (tmp_path / name).write_bytes(encoded(ball(), "PNG"))
+    (tmp_path / "d.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg"><circle id="a" r="9"/></svg>')
+    (tmp_path / "tree.json").write_text(RED)
+    found = fails(OUTPUT, *command)
+    assert ("would be lost" if command[-1] == "." else "give -o another name") in found
+
+
+@pytest.mark.parametrize("name", ["normals.png", "tree.json", "layers"])
+def test_files_of_someone_else_stay(name: str, tmp_path: Path, fails: Fails) -> None:
+    (tmp_path / "ball.png").write_bytes(encoded(ball(), "PNG"))
+    (tmp_path / name).write_text("mine")
+    assert f"since {name} in this one would be lost" in fails(OUTPUT, "extract", tmp_path / "ball.png", "-o", tmp_path)
+    if name != "normals.png":
+        assert f"since {name} in this one would be lost" in fails(OUTPUT, "analogy", *[RED] * 5, "-o", tmp_path)
+
+
+def test_all_outputs_are_looked_at_before_the_first_is_written(tmp_path: Path, fails: Fails) -> None:
+    new, nowhere = tmp_path / "new.json", tmp_path / "none" / "a.png"
+    fails(OUTPUT, "edit", RED, "--recolor", "teal", "-o", new, "--render", nowhere)
+    fails(OUTPUT, "edit", RED, "--recolor", "teal", "-o", new, "--render", tmp_path / "a.xyz")
+    fails(OUTPUT, "relight", RED, "--turn", "9,9", "-o", new, "--render", nowhere)
+    assert ".avi" in fails(OUTPUT, "relight", RED, "--turn", "9,9", "-o", new, "--turntable", tmp_path / "a.avi")
+
+
+def test_a_choice_that_is_missing_is_one_line(tmp_path: Path, fails: Fails) -> None:
+    assert "'--take'. Choose from: albedo," in fails(2, "mix", RED, RED, "-o", tmp_path / "x.json")
+
+
 GOOD = dumps(parse(RED))
 
 

@@ -20,9 +20,11 @@ import pytest
 import torch
 from PIL import Image as PILImage
 
+import photo_scenes
 import unshade
 from unshade import cli
 from unshade.nodes import Family, Member, Tree
+from unshade.picture_output import write_picture
 from unshade.render import render
 from unshade.serde import dump, load, load_family, parse
 from unshade.sphere import sphere_normals
@@ -401,6 +403,21 @@ def test_render_in_bands_is_render_at_once(tmp_path: Path, run: Run, monkeypatch
     pixels = pixels_of(tmp_path / "drawn.png")[..., :3]
     expected = render(parse(LIT), sphere_normals(50)).permute(1, 2, 0).mul(255).round().byte().numpy()
     assert np.abs(pixels.astype(int) - expected).max() <= 1
+
+
+def test_render_tells_the_convention_of_a_normal_map(tmp_path: Path, run: Run) -> None:
+    normals, mask = photo_scenes.knot(96)
+    pictures = {}
+    for name, green in (("up", 1.0), ("down", -1.0)):
+        write_picture(tmp_path / f"{name}.png", normals * torch.tensor([1.0, green, 1.0]).view(3, 1, 1) * 0.5 + 0.5, mask)
+        drawn = run("render", LIT, "-o", tmp_path / "drawn.png", "--normals", tmp_path / f"{name}.png")
+        assert drawn.code == 0 and ("read as DirectX (green down)" in drawn.err) == (name == "down")
+        pictures[name] = pixels_of(tmp_path / "drawn.png").astype(int)
+    assert np.abs(pictures["up"] - pictures["down"]).max() <= 3
+    assert set(np.unique(pictures["up"][..., 3])) >= {0, 255}
+    wrong = run("render", LIT, "-o", tmp_path / "x.png", "--normals", tmp_path / "down.png", "--green", "opengl")
+    assert wrong.code == 3 and "shows DirectX" in wrong.err
+    assert run("render", LIT, "-o", tmp_path / "x.png", "--green", "opengl").code == 2
 
 
 def test_render_over_normals_and_in_parts(tmp_path: Path, run: Run) -> None:

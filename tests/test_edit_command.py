@@ -50,14 +50,19 @@ def test_edit_many_with_a_script(tmp_path: Path, capsys: pytest.CaptureFixture[s
     script = tmp_path / "colder.toml"
     script.write_text('[[edit]]\nrecolor = "navy"\n[[edit]]\nremove = "rim"\n', encoding="utf-8")
     for name, text in {"a": BALL, "b": PLAIN, "c": BALL}.items():
-        (tmp_path / f"{name}.json").write_text(text, encoding="utf-8")
-    trees = [tmp_path / f"{name}.json" for name in "abc"]
+        (tmp_path / f"{name}.{'txt' if name == 'b' else 'json'}").write_text(text, encoding="utf-8")
+    trees = [tmp_path / f"{name}.{'txt' if name == 'b' else 'json'}" for name in "abc"]
     assert "edit 2 (remove): no node 'rim'" in fails(
         capsys, 7, "edit", *trees, "--script", script, "-o", tmp_path / "out", "--render", ".png"
     )
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.json", "a.png", "c.json", "c.png"]
     script.write_text(script.read_text(encoding="utf-8") + "optional = true\n", encoding="utf-8")
     done("edit", *trees, "--script", script, "-o", tmp_path / "out")
+    assert (tmp_path / "out" / "b.json").exists()
+    script.write_text("[[edit]]\nmove_light = [30]\n", encoding="utf-8")
+    assert "takes [right, up] or [right, up, roll] in degrees, got [30]" in fails(
+        capsys, 4, "edit", BALL, "--script", script, "-o", tmp_path / "x.json"
+    )
     assert load(tmp_path / "out" / "b.json").find("albedo")["color"] == pytest.approx((0, 0, 128 / 255))  # type: ignore[index]
 
 

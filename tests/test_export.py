@@ -97,7 +97,8 @@ def test_the_verb_writes_and_warns(tmp_path: Path, capsys: pytest.CaptureFixture
         (["--to", "sgv", "-o", "x.svg"], 2, "did you mean 'svg'"),
         (["-o", "none/x.svg"], 5, "cannot be written"),
         (["-o", "x.svg", "--bits", "16"], 2, "svg has no option 'bits'"),
-        (["-o", "x.svg", "--shape", "nowhere.svg"], 3, "not an SVG that can be read"),
+        (["-o", "x.svg", "--shape", "nowhere.svg"], 3, "nowhere.svg: cannot be read (No such file or directory)"),
+        (["-o", "x.svg", "--region", "a"], 2, "--region is for --shape"),
     ],
 )
 def test_the_verb_says_what_is_wrong(

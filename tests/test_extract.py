@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 
 import photo_scenes as scenes
+from unshade import scene_linear
 from unshade.color_profiles import srgb_encode
 from unshade.errors import PictureError
 from unshade.extract import from_ball, from_drawing, from_mask, from_normal_map
@@ -157,6 +159,25 @@ def test_encodings_are_told(tmp_path: Path, encode: str) -> None:
     found = read(tmp_path, normals, mask, encode)
     assert found.convention.encoding == encode
     assert float((found.normals - normals).norm(dim=0)[mask[0] > 0].median()) < 0.02
+
+
+@pytest.mark.skipif(importlib.util.find_spec("OpenEXR") is None, reason="OpenEXR is not installed")
+def test_an_exr_holds_vectors_or_colours(tmp_path: Path) -> None:
+    normals = np.moveaxis(sphere_normals(32).numpy(), 0, -1)
+    for encoding, pixels in (("vectors", normals), ("unit", normals * 0.5 + 0.5)):
+        scene_linear.write_exr(tmp_path / "n.exr", pixels.astype(np.float32), None)
+        found = read_normal_map(tmp_path / "n.exr")
+        assert found.convention.encoding == encoding
+        assert float((found.normals - sphere_normals(32)).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("fault", ["clean", "stripes and shadow"])
+def test_a_photo_is_no_normal_map(tmp_path: Path, fault: str) -> None:
+    for shape in scenes.OBJECTS.values():
+        for kind in scenes.TREES:
+            write_picture(tmp_path / "photo.png", scenes.photo(scenes.tree_of(kind), *shape(SIZE), fault))
+            with pytest.raises(PictureError, match="expected a normal map, whose colours are unit vectors"):
+                read_normal_map(tmp_path / "photo.png")
 
 
 def test_wrong_maps_are_named(tmp_path: Path, examples: Path) -> None:

@@ -17,7 +17,7 @@ from unshade import color_profiles
 from unshade.errors import MissingExtraError, OutputError, PictureError
 from unshade.nodes import leaf, multiply, screen
 from unshade.picture_files import read_picture
-from unshade.pictures import Disc, find_pictures, read_normals, read_sphere, sphere_from_array, write_picture
+from unshade.pictures import Disc, find_pictures, read_sphere, sphere_from_array, write_picture
 from unshade.png import write_png
 from unshade.render import render, srgb_encode
 from unshade.sphere import disc_mask, normals_from_xy, sphere_normals
@@ -590,33 +590,3 @@ def test_writing_is_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="ends in"):
         write_picture(tmp_path / "a.xyz", matcap())
     assert target.read_bytes() == before and {p.name for p in tmp_path.iterdir()} == {"a.png", "folder.png"}
-
-
-# --- Normal maps
-
-
-def test_normal_maps_are_read_as_opengl(tmp_path: Path) -> None:
-    normals = sphere_normals(64)
-    inside = disc_mask(64, 0.95)
-    stored = torch.where(inside, normals * 0.5 + 0.5, 0.5)
-    write_picture(tmp_path / "n8.png", stored)
-    write_picture(tmp_path / "n16.png", stored, bits=16)
-    for name, tolerance in (("n8.png", 0.01), ("n16.png", 1e-4)):
-        found = read_normals(tmp_path / name)
-        assert found.shape == (3, 64, 64)
-        assert float((found - normals)[:, inside[0]].abs().max()) < tolerance
-        assert torch.allclose(found[:, 0, 0], torch.tensor([0.0, 0.0, 1.0]))
-    with pytest.raises(PictureError, match="normal map"):
-        read_normals(save(tmp_path / "photo.png", np.full((16, 16, 3), (250, 20, 20), dtype=np.uint8)))
-
-
-@needs_exr
-def test_normal_maps_from_exr_hold_vectors_or_colours(tmp_path: Path) -> None:
-    import OpenEXR
-
-    normals = np.moveaxis(sphere_normals(32).numpy(), 0, -1)
-    for name, pixels in (("vectors", normals), ("colours", normals * 0.5 + 0.5)):
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        with OpenEXR.File(header, {"RGB": np.ascontiguousarray(pixels, dtype=np.float32)}) as file:
-            file.write(str(tmp_path / f"{name}.exr"))
-        assert float((read_normals(tmp_path / f"{name}.exr") - sphere_normals(32)).abs().max()) < 1e-3

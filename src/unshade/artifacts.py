@@ -13,7 +13,7 @@ import torch
 from unshade import drawing, metrics, report
 from unshade.errors import OutputError
 from unshade.nodes import Tree
-from unshade.pictures import SphereImage, read_normals, write_picture
+from unshade.pictures import SphereImage, write_picture
 from unshade.render import render
 from unshade.serde import dump
 from unshade.sphere import disc_mask, normals_from_xy, sphere_grid, sphere_normals
@@ -115,20 +115,12 @@ def disc_alpha(size: int) -> torch.Tensor:
     return ((1.0 - radius) * (size / 2.0) + 0.5).clamp(0.0, 1.0)
 
 
-def write_render(tree: Tree, path: Path, size: int, normals: Path | None) -> None:
-    """Draw a tree as a sphere of ``size`` pixels, or over the normal map ``normals``, into a picture file.
-
-    Raises:
-        PictureError: the normal map cannot be read.
-        OutputError: the picture cannot be written.
-    """
-    if normals is None:
-        grid = sphere_grid(size)
-        # In bands of rows: a large picture would otherwise take many times its size in memory.
-        bands = [render(tree, normals_from_xy(band)) for band in grid.split(max(1, BAND_PIXELS // size), dim=1)]
-        write_picture(path, torch.cat(bands, dim=1), disc_alpha(size), exposure=tree.exposure)
-    else:
-        write_picture(path, render(tree, read_normals(normals)), exposure=tree.exposure)
+def write_render(tree: Tree, path: Path, size: int) -> None:
+    """Draw a tree as a sphere of ``size`` pixels into a picture file. Raises OutputError."""
+    grid = sphere_grid(size)
+    # In bands of rows: a large picture would otherwise take many times its size in memory.
+    bands = [render(tree, normals_from_xy(band)) for band in grid.split(max(1, BAND_PIXELS // size), dim=1)]
+    write_picture(path, torch.cat(bands, dim=1), disc_alpha(size), exposure=tree.exposure)
 
 
 def write_sample(tree: Tree, folder: Path, name: str, size: int) -> None:

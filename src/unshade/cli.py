@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from unshade import __version__, batch, cli_verbs
+from unshade import __version__, batch, cli_extract, cli_verbs
 from unshade.arguments import SEED, output_options, read_document, read_tree
 from unshade.errors import TreeError, UnshadeError
 from unshade.staging import check_folder
@@ -284,11 +284,10 @@ def fit(
 @click.option(
     "--size", type=click.IntRange(1, 8192), default=256, show_default=True, metavar="N", help="Width and height of the sphere in pixels."
 )
-@click.option(
-    "--normals", type=click.Path(path_type=Path), metavar="FILE", help="A normal map to shade instead of a sphere (+x right, +y up)."
-)
+@click.option("--normals", type=click.Path(path_type=Path), metavar="FILE", help="A normal map to shade instead of a sphere.")
+@cli_extract.GREEN
 @click.option("--part", type=click.Choice(["diffuse", "specular"]), help="Only form and paint, or only highlights, rims and reflections.")
-def render(tree: str, output: Path, size: int, normals: Path | None, part: str | None) -> None:
+def render(tree: str, output: Path, size: int, normals: Path | None, green: str, part: str | None) -> None:
     """Draw a tree as a sphere of any size, or over a normal map.
 
     \b
@@ -297,13 +296,12 @@ def render(tree: str, output: Path, size: int, normals: Path | None, part: str |
       unshade render out/ball -o diffuse.png --part diffuse
       unshade render "multiply(albedo(#cc2030), diffuse(left up))" -o shaded.png --normals vase_normals.png
     """
-    from unshade import artifacts
     from unshade.render import part as part_of
 
     found = read_tree(tree)
     if part:
         found = dataclasses.replace(found, root=part_of(found.root, part))
-    artifacts.write_render(found, output, size, normals)
+    cli_extract.draw(found, output, size, normals, green)
 
 
 @cli.command()
@@ -439,7 +437,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return code if isinstance(code, int) else 0
     except click.UsageError as error:
         where = f"{error.ctx.command_path} --help" if error.ctx else "unshade --help"
-        return _fail(f"{error.format_message().rstrip('.')} (see {where})", error.exit_code)
+        return _fail(f"{' '.join(error.format_message().split()).rstrip('.')} (see {where})", error.exit_code)
     except UnshadeError as error:
         return _fail(str(error), error.exit_code)
     except click.ClickException as error:

@@ -96,6 +96,7 @@ def apply_to(sources: Sequence[str], change: Callable[[Tree], Tree], output: Pat
 def write_tree(tree: Tree, path: Path, source: str, picture: Path | None = None) -> None:
     """Write a tree that was made of another, which is left as it is. Raises OutputError."""
     from unshade import artifacts
+    from unshade.picture_output import check_picture
     from unshade.serde import dump
 
     read = tree_file(source)
@@ -103,9 +104,11 @@ def write_tree(tree: Tree, path: Path, source: str, picture: Path | None = None)
         raise OutputError(f"{path}: this is the tree that is edited; give -o another name, so that the edit can be undone")
     if path.suffix.lower() != ".json":
         raise OutputError(f"{path}: expected a name that ends in .json for a tree, got {path.suffix or 'no suffix'!r}")
+    if picture is not None:
+        check_picture(picture)
     dump(tree, path)
     if picture is not None:
-        artifacts.write_render(tree, picture, PICTURE_SIZE, None)
+        artifacts.write_render(tree, picture, PICTURE_SIZE)
 
 
 def tree_names(sources: Sequence[str]) -> list[str]:
@@ -116,7 +119,7 @@ def tree_names(sources: Sequence[str]) -> list[str]:
         stem = (
             f"{number:03d}"
             if "(" in source or source == "-"
-            else (path.parent.name if path.name == TREE_FILE else path.name.removesuffix(".json"))
+            else (path.parent.name if path.name == TREE_FILE else path.stem if path.is_file() else path.name)
         )
         name, copy = stem, 2
         while name in names:

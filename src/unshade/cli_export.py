@@ -9,9 +9,10 @@ from typing import Any
 
 import click
 
-from unshade.arguments import read_tree
+from unshade.arguments import read_tree, tree_file
 from unshade.errors import UnshadeError
 from unshade.export.targets import OPTIONS, TARGETS, Option, target_of
+from unshade.files import check_kept
 
 
 def _click_option(option: Option) -> Callable[[Any], Any]:
@@ -74,6 +75,9 @@ def export(tree: str, name: str | None, output: Path, quiet: bool, **options: An
         check_options(target_of(target), given)
     except UnshadeError as error:
         raise click.UsageError(str(error)) from None
+    if "region" in given and "shape" not in given:
+        raise click.UsageError("--region is for --shape: the id of a path in that drawing")
+    check_kept(output, tree_file(tree), given.get("shape"))
     found = read_tree(tree)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -91,7 +95,7 @@ def _target_by_suffix(output: Path) -> str:
         raise click.UsageError(
             f"--to is missing: {output.suffix or 'a name without a suffix'} may be {' or '.join(fitting)}"
             if fitting
-            else f"--to is missing, and no target writes {output.suffix or 'a name without a suffix'!r} (see unshade export --list)"
+            else f"--to is missing, and no target writes {output.suffix or 'a name without a suffix'!r}; unshade export --list names them"
         )
     return fitting[0]
 

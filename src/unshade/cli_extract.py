@@ -11,12 +11,14 @@ import click
 from unshade.arguments import SEED, Disc, read_tree
 from unshade.cli_edit import Degrees
 from unshade.errors import OutputError
-from unshade.files import write_whole
-from unshade.staging import TREE_FILE, check_folder
+from unshade.files import check_kept, write_whole
+from unshade.staging import TREE_FILE, check_own
 
 if TYPE_CHECKING:
     from unshade.extract import Extraction
     from unshade.nodes import Tree
+    from unshade.normal_maps import Convention, NormalMap
+    from unshade.terminal import Messages
 
 
 class OptionalDisc(Disc):
@@ -29,15 +31,18 @@ class OptionalDisc(Disc):
 
 FILE = click.Path(path_type=Path)
 
+REPORT = "extract.json"
+WRITTEN = (REPORT, "matcap.png", "coverage.png", "unseen.png", "normals.png", "shape.png")
+"""What `extract` writes beside the tree."""
 
-_GREEN = click.option(
+GREEN = click.option(
     "--green",
     type=click.Choice(["auto", "opengl", "directx"]),
     default="auto",
     show_default=True,
     help="Which way the normal map's green points.",
 )
-_SPACE = click.option(
+SPACE = click.option(
     "--space", type=click.Choice(["auto", "tangent", "camera"]), default="auto", show_default=True, help="What the normal map's axes are."
 )
 
@@ -50,8 +55,8 @@ _SPACE = click.option(
 @click.option("--normals", type=FILE, metavar="FILE", help="A normal map of the object, of the photo's size.")
 @click.option("--mask", type=FILE, metavar="FILE", help="The object's outline, white or opaque; its normals are guessed by inflating it.")
 @click.option("--region", metavar="ID", help="Of an SVG: the shape or group whose shading is lifted off.")
-@_GREEN
-@_SPACE
+@GREEN
+@SPACE
 @click.option(
     "--texture",
     type=click.Choice(["auto", "keep", "remove"]),
@@ -91,11 +96,15 @@ def extract(photo: Path, output: Path, preset: str | None, seed: int, quiet: boo
     from unshade.staging import staged
     from unshade.terminal import Messages
 
-    check_folder(output)
+    check_own(output, REPORT, WRITTEN)
+    for name in WRITTEN:
+        check_kept(output / name, photo, options["normals"], options["mask"], options["ignore"])
     messages = Messages(quiet)
     found = _extract(photo, **options)
     report = _report(found, photo)
-    for line in _said(found, options["normals"]):
+    if found.convention is not None:
+        messages.say(_read_as(options["normals"], found.convention, found.told))
+    for line in _said(found):
         messages.say(line)
     size = found.image.shape[-1]
     seen = found.coverage >= 0.5
@@ -113,7 +122,7 @@ def extract(photo: Path, output: Path, preset: str | None, seed: int, quiet: boo
         write_picture(folder / "normals.png", found.normals * 0.5 + 0.5, found.mask, bits=16)
         if options["region"] is not None:
             write_picture(folder / "shape.png", found.photo, found.mask)
-        (folder / "extract.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        (folder / REPORT).write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
         if family is not None:
             dump(family, folder / TREE_FILE)
     if as_json:
@@ -164,15 +173,13 @@ def _report(found: Extraction, photo: Path) -> dict[str, Any]:
     }
 
 
-def _said(found: Extraction, normals: Path | None) -> list[str]:
-    lines = []
-    if found.convention is not None:
-        lines.append(
-            f"{normals}: read as {found.convention}"
-            + ("" if found.told else "; the map does not show which, say --green directx if it is not")
-        )
-    if found.guess:
-        lines.append("the normals are a guess: the outline was blown up like a balloon")
+def _read_as(normals: Path, convention: Convention, told: bool) -> str:
+    other = "directx" if convention.green == "opengl" else "opengl"
+    return f"{normals}: read as {convention}" + ("" if told else f"; the map does not show which, say --green {other} if it is not")
+
+
+def _said(found: Extraction) -> list[str]:
+    lines = ["the normals are a guess: the outline was blown up like a balloon"] if found.guess else []
     for paint in found.paints:
         color = ", ".join(f"{number:.2f}" for number in paint.ratio)
         what = "a shadow or grey paint" if paint.shadow else "a paint"
@@ -193,8 +200,8 @@ def _said(found: Extraction, normals: Path | None) -> list[str]:
     show_default=True,
     help="How the photo's detail comes along: as a texture under the lights, or added.",
 )
-@_GREEN
-@_SPACE
+@GREEN
+@SPACE
 @click.option("--drawing", type=FILE, metavar="SVG", help="Shade a shape of a drawing instead; -o is then an SVG too.")
 @click.option("--region", metavar="ID", help="The shape or group of the drawing.")
 @click.option("--mesh", type=FILE, metavar="FILE", help="Shade a mesh instead: GLB, glTF, OBJ, PLY, STL or OFF.")
@@ -240,37 +247,67 @@ def apply(tree: str, output: Path, quiet: bool, **given: Any) -> None:
         raise click.UsageError("--photo needs --normals, the normals of what it shows")
     if (given["region"] is not None) != (chosen == ["drawing"]):
         raise click.UsageError("--drawing and --region go together")
+    check_kept(output, given["normals"], given["photo"], given["drawing"], given["mesh"])
     edited = read_tree(tree)
     original = read_tree(given["source"]) if given["source"] is not None else None
     messages = Messages(quiet)
     {"normals": _on_normals, "drawing": _on_drawing, "mesh": _on_mesh}[chosen[0]](edited, original, output, messages, given)
 
 
-def _on_normals(edited: Tree, original: Tree | None, output: Path, messages: Any, given: dict[str, Any]) -> None:
+def read_normals(path: Path, green: Any, space: Any, messages: Messages) -> NormalMap:
+    """A normal map; says how it was read unless that is as most maps are. Raises PictureError."""
+    from unshade.normal_maps import Convention, read_normal_map
+
+    found = read_normal_map(path, green=green, space=space)
+    if not found.told or found.convention != Convention():
+        messages.say(_read_as(path, found.convention, found.told))
+    return found
+
+
+def shade_normals(tree: Tree, output: Path, path: Path, green: str = "auto", space: str = "auto", quiet: bool = False) -> None:
+    """Draw a tree over a normal map, on transparency where the map holds no normals. Raises PictureError, OutputError."""
+    from unshade.apply import shade
+    from unshade.picture_output import write_picture
+    from unshade.terminal import Messages
+
+    check_kept(output, path)
+    found = read_normals(path, green, space, Messages(quiet))
+    masked = bool((found.mask < 1.0).any()) and output.suffix.lower() not in (".jpg", ".jpeg", ".bmp")
+    write_picture(output, shade(tree, found.normals.float()), found.mask if masked else None, exposure=tree.exposure)
+
+
+def draw(tree: Tree, output: Path, size: int, normals: Path | None, green: str) -> None:
+    """What `render` does: a sphere of ``size`` pixels, or a normal map. Raises UsageError, PictureError, OutputError."""
+    from unshade import artifacts
+
+    if normals is not None:
+        shade_normals(tree, output, normals, green)
+    elif green != "auto":
+        raise click.UsageError("--green is for --normals")
+    else:
+        artifacts.write_render(tree, output, size)
+
+
+def _on_normals(edited: Tree, original: Tree | None, output: Path, messages: Messages, given: dict[str, Any]) -> None:
     import torch
 
-    from unshade.apply import apply_to_photo, shade
+    from unshade.apply import apply_to_photo
     from unshade.extract import read_photo
-    from unshade.normal_maps import check_size, read_normal_map
+    from unshade.normal_maps import check_size
     from unshade.picture_output import write_picture
 
-    found = read_normal_map(given["normals"], green=given["green"], space=given["space"])
-    if not found.told or str(found.convention) != "OpenGL (green up)":
-        messages.say(f"{given['normals']}: read as {found.convention}" + ("" if found.told else ", which the map does not show"))
-    normals = found.normals.float()
-    if given["photo"] is None:
-        masked = bool((found.mask < 1.0).any()) and output.suffix.lower() not in (".jpg", ".jpeg", ".bmp")
-        write_picture(output, shade(edited, normals), found.mask if masked else None, exposure=edited.exposure)
+    if original is None:
+        shade_normals(edited, output, given["normals"], given["green"], given["space"], messages.quiet)
         return
-    assert original is not None
+    found = read_normals(given["normals"], given["green"], given["space"], messages)
     photo, alpha, exposure = read_photo(given["photo"], original.exposure)
     check_size(found, given["normals"], photo.shape[-1], photo.shape[-2], given["photo"])
-    result = apply_to_photo(edited, original, photo, normals, found.mask, given["detail"])
+    result = apply_to_photo(edited, original, photo, found.normals.float(), found.mask, given["detail"])
     assert torch.isfinite(result).all()
     write_picture(output, result, alpha, exposure=exposure)
 
 
-def _on_drawing(edited: Tree, original: Tree | None, output: Path, messages: Any, given: dict[str, Any]) -> None:
+def _on_drawing(edited: Tree, original: Tree | None, output: Path, messages: Messages, given: dict[str, Any]) -> None:
     from unshade.apply import shade_shape
     from unshade.vector_art import Drawing
 
@@ -283,7 +320,7 @@ def _on_drawing(edited: Tree, original: Tree | None, output: Path, messages: Any
     write_whole(output, drawing.give_back(given["region"], shape).encode("utf-8"))
 
 
-def _on_mesh(edited: Tree, original: Tree | None, output: Path, messages: Any, given: dict[str, Any]) -> None:
+def _on_mesh(edited: Tree, original: Tree | None, output: Path, messages: Messages, given: dict[str, Any]) -> None:
     from unshade.mesh import View, read_mesh, render_mesh
     from unshade.picture_output import write_picture
 

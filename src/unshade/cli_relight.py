@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
-from unshade.arguments import read_tree
+from unshade.arguments import read_tree, tree_file
 from unshade.cli_edit import PICTURE_SIZE, Degrees, write_tree
+from unshade.files import check_kept
 
 
 @click.command()
@@ -74,15 +75,22 @@ def relight(
     from unshade import relight as lights
     from unshade.edit import read_direction
     from unshade.nodes import Tree, leaf
-    from unshade.picture_output import write_picture
+    from unshade.picture_output import check_picture, write_picture
     from unshade.surroundings import Surroundings, under
-    from unshade.turntable import frame, write_turntable
+    from unshade.turntable import check_turntable, frame, write_turntable
     from unshade.turntable import turntable as turned
 
     if output is None and picture is None and turntable is None:
         raise click.UsageError("nothing to write: give -o, --render or --turntable")
     if turn is not None and turn[0] is not None:
         raise click.UsageError("--turn turns all of the light; `unshade edit --move-light ADDRESS=RIGHT,UP` moves one")
+    for path in (picture, turntable):
+        if path is not None:
+            check_kept(path, environment, tree_file(tree))
+    if picture is not None:
+        check_picture(picture)
+    if turntable is not None:
+        check_turntable(turntable)
     lit = sky = read_tree(tree)
     if environment is not None:
         surroundings = Surroundings.read(environment)

@@ -12,7 +12,7 @@ from unshade.arguments import SEED, read_tree, tree_file
 from unshade.cli_edit import apply_to, output_option, tree_names
 from unshade.errors import OutputError
 from unshade.files import write_whole
-from unshade.staging import check_folder
+from unshade.staging import check_own
 
 if TYPE_CHECKING:
     from unshade.nodes import Tree
@@ -94,7 +94,7 @@ def analogy(a: str, b: str, ab: str, p: str, q: str, output: Path, preset: str, 
     from unshade.staging import TREE_FILE, staged
     from unshade.terminal import Messages
 
-    check_folder(output)
+    check_own(output, "analogy.json", ())
     messages = Messages(quiet)
     given = [_tree_or_picture(source) for source in (a, b, ab, p, q)]
     found = understand(*given, preset=preset, seed=seed, told=lambda name: messages.say(f"decomposing {name}"))

@@ -52,7 +52,7 @@ def _is_text(value: Any) -> bool:
 
 
 def _is_turn(value: Any) -> bool:
-    return isinstance(value, list) and 1 <= len(value) <= 3 and all(map(_is_number, value))
+    return isinstance(value, list) and 2 <= len(value) <= 3 and all(map(_is_number, value))
 
 
 VERBS = {

@@ -3,11 +3,32 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
 from pathlib import Path
 
 from unshade.errors import OutputError
+
+
+def check_place(path: Path) -> None:
+    """Fail before the work is done rather than after it: a file that is in the way or write-protected, a folder that is not there.
+
+    A file that takes another's name at once would replace a protected one too, so that is looked at here. Raises OSError.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "it is a directory")
+    if path.exists() and not (os.access(path, os.W_OK) and path.stat().st_mode & 0o222):
+        raise PermissionError(errno.EACCES, "it is write-protected")
+    if not path.parent.exists():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+
+
+def check_kept(path: Path, *read: str | Path | None) -> None:
+    """Raises OutputError where ``path`` is one of the files that were read: it would be lost."""
+    for source in read:
+        if source is not None and path.exists() and Path(source).exists() and path.samefile(source):
+            raise OutputError(f"{path}: this is a file that is read; give -o another name, so that it is kept")
 
 
 def write_whole(path: str | os.PathLike[str], data: bytes) -> None:
@@ -19,6 +40,7 @@ def write_whole(path: str | os.PathLike[str], data: bytes) -> None:
     target = Path(path)
     temporary = target.parent / f".unshade-{secrets.token_hex(6)}.tmp"
     try:
+        check_place(target)
         try:
             with open(temporary, "xb") as file:
                 file.write(data)

@@ -16,6 +16,7 @@ from PIL import Image as PILImage
 from unshade import scene_linear
 from unshade.color_profiles import srgb_decode
 from unshade.errors import OutputError
+from unshade.files import check_place
 from unshade.png import write_png
 from unshade.types import Image, Mask
 
@@ -30,8 +31,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     temporary: Path | None = None
     try:
-        if path.is_dir():
-            raise IsADirectoryError(None, "it is a directory")
+        check_place(path)
         handle, name = tempfile.mkstemp(prefix=f".{path.stem[:40]}-", suffix=path.suffix, dir=path.parent)
         os.close(handle)
         temporary = Path(name)
@@ -73,9 +73,7 @@ def write_picture(path: str | Path, image: Image, alpha: Mask | None = None, *, 
         OutputError: an unknown suffix, or a place that cannot be written. Nothing half-written is left.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in _PILLOW and suffix != ".exr":
-        raise OutputError(f"{path}: expected a name that ends in {', '.join([*_PILLOW, '.exr'])}, got {path.suffix or 'no suffix'!r}")
+    suffix = _suffix(path)
     if bits not in (8, 16) or (bits == 16 and suffix not in (".png", ".exr")):
         raise OutputError(f"{path}: expected 8 bits, or 16 for PNG, got {bits} for {suffix}")
     if image.ndim != 3 or image.shape[0] not in (1, 3) or (alpha is not None and alpha.shape != (1, *image.shape[1:])):
@@ -90,6 +88,22 @@ def write_picture(path: str | Path, image: Image, alpha: Mask | None = None, *, 
     color = color.clip(0.0, 1.0)
     with replacing(path) as temporary:
         _writer(suffix, color, opacity, bits, exposure)(temporary)
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in _PILLOW and suffix != ".exr":
+        raise OutputError(f"{path}: expected a name that ends in {', '.join([*_PILLOW, '.exr'])}, got {path.suffix or 'no suffix'!r}")
+    return suffix
+
+
+def check_picture(path: Path) -> None:
+    """Fail before other files are written: raises OutputError where `write_picture` would for this name."""
+    _suffix(path)
+    try:
+        check_place(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 def _writer(

@@ -18,9 +18,9 @@ from unshade.picture_files import MIN_SIDE, SUFFIXES, Picture, read_picture
 from unshade.picture_output import write_picture
 from unshade.sphere import sphere_grid
 from unshade.sphere_finder import Disc, disc_of_alpha, find_disc
-from unshade.types import Image, Mask, Normals
+from unshade.types import Image, Mask
 
-__all__ = ["Disc", "SphereImage", "find_pictures", "read_normals", "read_sphere", "sphere_from_array", "write_picture"]
+__all__ = ["Disc", "SphereImage", "find_pictures", "read_sphere", "sphere_from_array", "write_picture"]
 
 SIZE = 256
 """Width and height a sphere is brought to."""
@@ -223,32 +223,3 @@ def find_pictures(paths: Iterable[str | Path]) -> list[Path]:
         else:
             raise PictureError(f"{path}: no such file")
     return list(dict.fromkeys(found))
-
-
-def read_normals(path: str | Path) -> Normals:
-    """A normal map: (3, H, W) float32 unit vectors, +x right, +y up, +z to the viewer.
-
-    Tangent-space encoding as OpenGL has it, ``n = 2 * rgb - 1``; an EXR without a number below zero is read the same
-    way, one with negative numbers holds the vectors themselves. Transparent and zero pixels get (0, 0, 1).
-    """
-    path = Path(path)
-    picture = read_picture(path, colors=False)
-    if picture.scene_linear and picture.rgb.min() < 0:
-        vectors = picture.rgb.astype(np.float64)
-    else:
-        vectors = 2.0 * picture.rgb.astype(np.float64) - 1.0
-        # 8-bit maps store 128 of 255 for zero.
-        vectors = np.where(np.abs(vectors) < 0.51 / 127.5, 0.0, vectors)
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    away = vectors[..., 2] < -0.1
-    if picture.alpha is not None:
-        away &= picture.alpha > 0.5
-    if away.mean() > 0.02 or not 0.5 < float(np.median(length)) < 1.5:
-        raise PictureError(
-            f"{path}: expected a normal map (blue facing the viewer, OpenGL green up), got colours that are not unit vectors"
-        )
-    empty = length[..., 0] < 0.1
-    if picture.alpha is not None:
-        empty |= picture.alpha < 0.5
-    vectors = np.where(empty[..., None], (0.0, 0.0, 1.0), vectors / np.maximum(length, 1e-6))
-    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(vectors, -1, 0)).astype(np.float32))

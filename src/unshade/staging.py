@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from unshade.errors import OutputError
@@ -58,6 +58,16 @@ def _publish(staging: Path, folder: Path) -> None:
             old.unlink(missing_ok=True)
     for new in sorted(staging.iterdir(), key=lambda path: path.name == TREE_FILE):
         os.replace(new, folder / new.name)
+
+
+def check_own(folder: Path, marker: str, names: Iterable[str]) -> None:
+    """Fail where results would take the place of someone else's files: any of ``names`` or `MADE`, in a folder without ``marker``,
+    the file that every folder of such results holds. Raises OutputError."""
+    check_folder(folder)
+    if not (folder / marker).exists():
+        for name in (*names, *MADE):
+            if (folder / name).exists():
+                raise OutputError(f"{folder}: expected a new folder or one with {marker}, since {name} in this one would be lost")
 
 
 def check_folder(folder: Path) -> None:

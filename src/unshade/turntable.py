@@ -14,6 +14,7 @@ from PIL import Image as PILImage
 
 from unshade.components import Use, uses
 from unshade.errors import MissingExtraError, OutputError
+from unshade.files import check_place
 from unshade.nodes import KINDS, Leaf, Node, Operator, Raster, Role, Tree, find
 from unshade.picture_output import replacing
 from unshade.relight import lit_leaves, relight
@@ -153,20 +154,34 @@ def check_new_folder(folder: Path) -> None:
         raise OutputError(f"{folder}: expected a new or an empty folder, and there are files in this one")
 
 
-def write_turntable(path: Path, pictures: Iterator[Image], fps: float = 24.0) -> int:
-    """Write frames as an animated GIF, an MP4 (both play in a loop or once through), or, without a suffix, a folder of PNG.
-
-    Returns how many there were. Raises OutputError, and MissingExtraError for an MP4 without its library.
-    """
+def check_turntable(path: Path) -> None:
+    """Fail before other files are written: raises OutputError, MissingExtraError where `write_turntable` would for this name."""
     suffix = path.suffix.lower()
     if suffix and suffix not in VIDEO_SUFFIXES:
         raise OutputError(
             f"{path}: expected a name that ends in {' or '.join(VIDEO_SUFFIXES)}, or a folder's name without a suffix, got {suffix!r}"
         )
+    if not suffix:
+        check_new_folder(path)
+        return
+    try:
+        check_place(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+    if suffix == ".mp4":
+        _encoder(path)
+
+
+def write_turntable(path: Path, pictures: Iterator[Image], fps: float = 24.0) -> int:
+    """Write frames as an animated GIF, an MP4 (both play in a loop or once through), or, without a suffix, a folder of PNG.
+
+    Returns how many there were. Raises OutputError, and MissingExtraError for an MP4 without its library.
+    """
+    check_turntable(path)
+    suffix = path.suffix.lower()
     encoder = _encoder(path) if suffix == ".mp4" else None
     arrays = [(picture.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).permute(1, 2, 0).numpy() for picture in pictures]
     if not suffix:
-        check_new_folder(path)
         with staged(path) as folder:
             for number, array in enumerate(arrays):
                 PILImage.fromarray(array).save(folder / f"{number:0{len(str(len(arrays) - 1))}d}.png")

@@ -43,7 +43,9 @@ def read_shape(path: Path, region: str | None = None) -> Shape:
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             document = svgelements.SVG.parse(io.StringIO(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, ValueError, SyntaxError) as error:
+    except OSError as error:
+        raise PictureError(f"{path}: cannot be read ({error.strerror})") from None
+    except (UnicodeDecodeError, ValueError, SyntaxError) as error:
         raise PictureError(f"{path}: not an SVG that can be read ({str(error).splitlines()[0]})") from None
     shapes = [element for element in document.elements() if isinstance(element, svgelements.Shape) and len(svgelements.Path(element))]
     if region is not None:
