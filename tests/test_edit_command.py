@@ -85,7 +85,7 @@ def test_edit_like_another(tmp_path: Path) -> None:
         (2, ["--name", "rim"], "expected ADDRESS=NAME"),
         (2, [], "nothing to do"),
         (4, ["--script", "nosuch.toml"], "cannot read nosuch.toml"),
-        (4, ["--like", BALL, PLAIN], "not where it adds leaves"),
+        (4, ["--like", PLAIN, BALL], "not where it adds leaves"),
     ],
 )
 def test_edit_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str], code: int, arguments: list[str], message: str) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from strategies import trees
 from unshade.analogy import analogy
 from unshade.components import Component, put_together, take_apart, uses
-from unshade.edit import remove, set_value
+from unshade.edit import move_light, remove, set_value
 from unshade.errors import PictureError, TreeError
 from unshade.grammar import sample
 from unshade.metrics import psnr
@@ -184,6 +184,14 @@ def test_replay_on_the_same_tree_is_the_edit() -> None:
     for edit in ("albedo:0.color=#20a040", "diffuse.ambient=0.5", "rim.exponent*=2", "stripe.direction=left"):
         edited = set_value(A, edit)
         assert same(replay(A, edited, A), edited), edit
+
+
+def test_replay_of_all_kinds_of_edits_at_once() -> None:
+    edited = remove(move_light(set_value(A, "highlight.sharpness*=2"), 20.0, 10.0), "rim")
+    assert same(replay(A, edited, A), edited)
+    two = parse("screen(albedo(#202020), highlight(left, 20), highlight(right, 50))")
+    edited = remove(set_value(two, "highlight:1.amplitude=0.5"), "highlight:0")
+    assert same(replay(two, edited, two), edited), "the one that is left is told by what it keeps"
 
 
 def test_replay_refuses() -> None:

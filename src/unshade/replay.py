@@ -9,7 +9,7 @@ colour carried over with the scale between the two.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -140,20 +140,32 @@ def _matched(root: Node, address: str, other: Node) -> list[str]:
 def _changes(before: Node, after: Node) -> tuple[dict[str, tuple[Leaf, Leaf]], list[str]]:
     """Leaves with other numbers, and leaves that are gone, by their addresses before."""
     ours = {address: node for address, node in walk(before) if isinstance(node, Leaf)}
-    theirs = {address: node for address, node in walk(after) if isinstance(node, Leaf)}
-    if [*ours] == [*theirs]:
-        return {address: (ours[address], theirs[address]) for address in ours if ours[address].values != theirs[address].values}, []
-    left = list(theirs.values())
-    lost = []
-    for address, leaf in ours.items():
-        if leaf in left:
-            left.remove(leaf)
-        else:
-            lost.append(address)
-    if left:
+    theirs = [node for _, node in walk(after) if isinstance(node, Leaf)]
+    kept = _kept(list(ours.values()), theirs)
+    if kept is None:
         raise TreeError("an edit can be repeated where it changes numbers of leaves or takes leaves away, not where it adds leaves")
+    addresses = [*ours]
+    pairs = {addresses[number]: (ours[addresses[number]], leaf) for number, leaf in zip(kept, theirs, strict=True)}
+    lost = [address for address in ours if address not in pairs]
     tints = uses(before)
-    return {}, [address for address in lost if not tints[address].tint] or lost
+    changed = {address: (old, new) for address, (old, new) in pairs.items() if old.values != new.values}
+    return changed, [address for address in lost if not tints[address].tint] or lost
+
+
+def _kept(ours: Sequence[Leaf], theirs: Sequence[Leaf]) -> tuple[int, ...] | None:
+    """Which of our leaves became theirs: in the same order, of the same kinds, with the fewest changed parameters. None if none can."""
+    # For each number of our first leaves, the fewest changes to what has been seen of theirs, and who became it.
+    best: list[tuple[int, tuple[int, ...]] | None] = [(0, ())] * (len(ours) + 1)
+    for leaf in theirs:
+        row: list[tuple[int, tuple[int, ...]] | None] = [None]
+        for number, own in enumerate(ours):
+            found = [row[number]]
+            if (so_far := best[number]) is not None and own.kind == leaf.kind:
+                changes = sum(mine != other for mine, other in zip(own.values, leaf.values, strict=True))
+                found.append((so_far[0] + changes, (*so_far[1], number)))
+            row.append(min((one for one in found if one is not None), default=None))
+        best = row
+    return None if best[-1] is None else best[-1][1]
 
 
 def _changed_alike(leaf: Leaf, old: Leaf, new: Leaf, same_kind: bool) -> Leaf:
