@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from pathlib import Path
 
 import numpy as np
@@ -262,3 +263,18 @@ def test_bad_drawings(tmp_path: Path, text: str, region: str, message: str) -> N
     with pytest.raises(PictureError) as caught:
         Drawing.read(tmp_path / "d.svg").lift(region)
     assert message in str(caught.value)
+
+
+def test_the_page_says_what_was_measured() -> None:
+    root = Path(__file__).resolve().parent.parent
+    found = json.loads((root / "benchmarks" / "results" / "photographs" / "photographs.json").read_text(encoding="utf-8"))
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in (root / "docs" / "photographs.md").read_text("utf-8").splitlines()]
+    page = {row[0]: [float(cell) for cell in row[1:]] for row in rows if len(row) in (5, 7) and row[1][:1].isdigit()}
+    keys = ("psnr_seen", "worst", "psnr_seen_plain")
+    for fault in scenes.FAULTS:
+        measured = [found["summary"][f"{shape}, {fault}"][key] for shape in ("knot", "pebble") for key in keys]
+        assert page.pop(fault) == pytest.approx(measured, abs=0.051), fault
+    keys = ("photo itself", "residual", "ratio", "ratio, known tree")
+    for case, measured in found["apply"].items():
+        assert page.pop(case) == pytest.approx([measured[key] for key in keys], abs=0.051), case
+    assert not page

@@ -123,7 +123,8 @@ def _sugar(kind: str, parameter: str, text: str, where: str) -> tuple[float, ...
     except TreeError as error:
         # The column would be that of the sentence made here, not of what was given.
         reason = str(error).partition("\n")[0].partition(": ")[2] or str(error)
-        raise TreeError(f"{where}: {reason.removeprefix(f'{kind}.{parameter}: ')}, in {text!r}") from None
+        what = reason.removeprefix(f"{kind}.{parameter}: ")
+        raise TreeError(f"{where}: {what}" + ("" if repr(text) in what else f" (in {text!r})")) from None
     assert isinstance(leaf, Leaf)
     return tuple(leaf[parameter])
 
