@@ -184,6 +184,11 @@ def test_a_protected_file_stays(tmp_path: Path, fails: Fails) -> None:
         ["export", RED, "--shape", "d.svg", "-o", "d.svg"],
         ["relight", RED, "--environment", "sky.png", "--render", "sky.png"],
         ["edit", "tree.json", "--recolor", "teal", "-o", "tree.json"],
+        ["edit", "out/a.json", "a.json", "--recolor", "teal", "-o", "."],
+        ["edit", RED, "--like", RED, "tree.json", "-o", "tree.json"],
+        ["mix", RED, "tree.json", "--take", "albedo", "-o", "tree.json"],
+        ["transfer", "albedo", "tree.json", RED, "-o", "tree.json"],
+        ["library", "tree.json", "-o", "tree.json"],
         ["extract", "out/matcap.png", "-o", "out"],
         ["extract", "photo.png", "--normals", "normals.png", "-o", "."],
     ],
@@ -195,9 +200,10 @@ def test_what_is_read_is_kept(command: list[str], tmp_path: Path, fails: Fails, 
     for name in ("photo.png", "normals.png", "sky.png", "out/matcap.png"):
         (tmp_path / name).write_bytes(encoded(ball(), "PNG"))
     (tmp_path / "d.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg"><circle id="a" r="9"/></svg>')
-    (tmp_path / "tree.json").write_text(RED)
+    for name in ("tree.json", "a.json", "out/a.json"):
+        (tmp_path / name).write_text(RED)
     found = fails(OUTPUT, *command)
-    assert ("would be lost" if command[-1] == "." else "give -o another name") in found
+    assert ("would be lost" if command[0] == "extract" and command[-1] == "." else "give -o another name") in found
 
 
 @pytest.mark.parametrize("name", ["normals.png", "tree.json", "layers"])

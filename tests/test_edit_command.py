@@ -46,7 +46,7 @@ def test_edit_one_light_by_its_address(tmp_path: Path) -> None:
     assert tree.find("diffuse") == parse(BALL).find("diffuse") and tree.find("highlight") != parse(BALL).find("highlight")
 
 
-def test_edit_many_with_a_script(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edit_many_with_a_script(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     script = tmp_path / "colder.toml"
     script.write_text('[[edit]]\nrecolor = "navy"\n[[edit]]\nremove = "rim"\n', encoding="utf-8")
     for name, text in {"a": BALL, "b": PLAIN, "c": BALL}.items():
@@ -59,6 +59,10 @@ def test_edit_many_with_a_script(tmp_path: Path, capsys: pytest.CaptureFixture[s
     script.write_text(script.read_text(encoding="utf-8") + "optional = true\n", encoding="utf-8")
     done("edit", *trees, "--script", script, "-o", tmp_path / "out")
     assert (tmp_path / "out" / "b.json").exists()
+    monkeypatch.chdir(tmp_path / "out")
+    (tmp_path / "out" / "tree.json").write_text(BALL, encoding="utf-8")
+    done("edit", "tree.json", "a.json", "--recolor", "teal", "-o", tmp_path / "named")
+    assert sorted(path.name for path in (tmp_path / "named").iterdir()) == ["a.json", "out.json"]
     script.write_text("[[edit]]\nmove_light = [30]\n", encoding="utf-8")
     assert "takes [right, up] or [right, up, roll] in degrees, got [30]" in fails(
         capsys, 4, "edit", BALL, "--script", script, "-o", tmp_path / "x.json"

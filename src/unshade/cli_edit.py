@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import click
 
 from unshade.arguments import SEED, read_tree, tree_file
 from unshade.errors import OutputError, TreeError, UnshadeError
+from unshade.files import check_kept
 from unshade.staging import TREE_FILE, check_folder
 
 if TYPE_CHECKING:
@@ -62,13 +64,15 @@ def output_option(function: Any) -> Any:
     return function
 
 
-def apply_to(sources: Sequence[str], change: Callable[[Tree], Tree], output: Path, picture: Path | None) -> None:
+def apply_to(
+    sources: Sequence[str], change: Callable[[Tree], Tree], output: Path, picture: Path | None, also_read: Sequence[str] = ()
+) -> None:
     """Edit each tree and write the results; the first fault of one tree ends a call for one, and is told in a call for several.
 
     Raises TreeError, OutputError.
     """
     if len(sources) == 1 and output.suffix:
-        write_tree(change(read_tree(sources[0])), output, sources[0], picture)
+        write_tree(change(read_tree(sources[0])), output, [*sources, *also_read], picture)
         return
     from unshade.terminal import Messages
 
@@ -83,7 +87,7 @@ def apply_to(sources: Sequence[str], change: Callable[[Tree], Tree], output: Pat
             target = output / f"{name}.json"
             tree = change(read_tree(source))
             output.mkdir(parents=True, exist_ok=True)
-            write_tree(tree, target, source, target.with_suffix(suffix) if suffix else None)
+            write_tree(tree, target, [*sources, *also_read], target.with_suffix(suffix) if suffix else None)
         except UnshadeError as error:
             if len(sources) == 1 or isinstance(error, OutputError):
                 raise
@@ -93,15 +97,13 @@ def apply_to(sources: Sequence[str], change: Callable[[Tree], Tree], output: Pat
         raise click.exceptions.Exit(SOME_FAILED if failed < len(sources) else TreeError.exit_code)
 
 
-def write_tree(tree: Tree, path: Path, source: str, picture: Path | None = None) -> None:
-    """Write a tree that was made of another, which is left as it is. Raises OutputError."""
+def write_tree(tree: Tree, path: Path, sources: Sequence[str], picture: Path | None = None) -> None:
+    """Write a tree that was made of others, which are left as they are. Raises OutputError."""
     from unshade import artifacts
     from unshade.picture_output import check_picture
     from unshade.serde import dump
 
-    read = tree_file(source)
-    if read is not None and path.exists() and path.samefile(read):
-        raise OutputError(f"{path}: this is the tree that is edited; give -o another name, so that the edit can be undone")
+    check_kept(path, *map(tree_file, sources))
     if path.suffix.lower() != ".json":
         raise OutputError(f"{path}: expected a name that ends in .json for a tree, got {path.suffix or 'no suffix'!r}")
     if picture is not None:
@@ -115,7 +117,7 @@ def tree_names(sources: Sequence[str]) -> list[str]:
     """A file's name for each tree: that of its file or folder, numbered where two would be the same."""
     names: list[str] = []
     for number, source in enumerate(sources):
-        path = Path(source)
+        path = Path(os.path.abspath(source))
         stem = (
             f"{number:03d}"
             if "(" in source or source == "-"
@@ -194,7 +196,7 @@ def edit(trees: tuple[str, ...], output: Path, picture: Path | None, optional: b
             tree = remove(tree, *wanted) if wanted else tree
         return tree
 
-    apply_to(trees, change, output, picture)
+    apply_to(trees, change, output, picture, like or ())
 
 
 @click.command()

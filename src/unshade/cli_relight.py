@@ -101,7 +101,7 @@ def relight(
         lit, sky = lights.turn(lit, rotation), lights.turn(sky, rotation)
     shown = sky if inset else None
     if output is not None:
-        write_tree(lit, output, tree)
+        write_tree(lit, output, [tree])
     if picture is not None:
         write_picture(picture, frame(lit, size, shown))
     if turntable is not None:

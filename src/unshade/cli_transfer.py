@@ -11,7 +11,7 @@ import click
 from unshade.arguments import SEED, read_tree, tree_file
 from unshade.cli_edit import apply_to, output_option, tree_names
 from unshade.errors import OutputError
-from unshade.files import write_whole
+from unshade.files import check_kept, write_whole
 from unshade.staging import check_own
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def transfer(component: str, source: str, trees: tuple[str, ...], output: Path, 
     from unshade.transfer import transfer as moved
 
     given = read_tree(source)
-    apply_to(trees, lambda tree: moved(given, tree, component), output, picture)
+    apply_to(trees, lambda tree: moved(given, tree, component), output, picture, [source])
 
 
 @click.command()
@@ -57,7 +57,7 @@ def mix(first: str, second: str, take: tuple[str, ...], output: Path, picture: P
     from unshade.transfer import mix as mixed
 
     other = read_tree(second)
-    apply_to([first], lambda tree: mixed(tree, other, take), output, picture)
+    apply_to([first], lambda tree: mixed(tree, other, take), output, picture, [second])
 
 
 @click.command()
@@ -148,6 +148,7 @@ def library(trees: tuple[str, ...], output: Path, title: str) -> None:
     suffix = output.suffix.lower()
     if suffix not in (".html", ".json"):
         raise OutputError(f"{output}: expected a name that ends in .html or .json, got {output.suffix or 'no suffix'!r}")
+    check_kept(output, *map(tree_file, trees))
     named = [(name, read_tree(source)) for name, source in zip(tree_names(trees), trees, strict=True)]
     text = library_html(named, title) if suffix == ".html" else as_json(parts(named)) + "\n"
     write_whole(output, text.encode("utf-8"))
