@@ -220,6 +220,8 @@ def test_all_outputs_are_looked_at_before_the_first_is_written(tmp_path: Path, f
     fails(OUTPUT, "edit", RED, "--recolor", "teal", "-o", new, "--render", nowhere)
     fails(OUTPUT, "edit", RED, "--recolor", "teal", "-o", new, "--render", tmp_path / "a.xyz")
     fails(OUTPUT, "relight", RED, "--turn", "9,9", "-o", new, "--render", nowhere)
+    large = ["--turntable", tmp_path / "a.gif", "--frames", 2000, "--size", 2048]
+    assert "take fewer or smaller" in fails(OUTPUT, "relight", RED, "--turn", "9,9", "-o", new, *large)
     assert ".avi" in fails(OUTPUT, "relight", RED, "--turn", "9,9", "-o", new, "--turntable", tmp_path / "a.avi")
 
 

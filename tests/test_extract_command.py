@@ -122,6 +122,7 @@ def test_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (3, ["extract", "photo.png", "--normals", "small.png", "-o", "out"], "size of photo.png, 128 x 128, got 64 x 64"),
         (3, ["extract", "photo.png", "--normals", "normals.png", "--green", "opengl", "-o", "out"], "shows DirectX (green down)"),
         (3, ["extract", "none.png", "--disc", "-o", "out"], "no such file"),
+        (3, ["extract", "photo.png", "--mask", "black.png", "-o", "out"], "black.png: expected a shape of at least 16 pixels, got 0"),
         (5, ["extract", "photo.png", "--normals", "normals.png", "-o", "photo.png"], "expected a folder to write into"),
         (2, ["apply", "albedo(red)", "-o", "x.png"], "give one of --normals, --drawing and --mesh"),
         (2, ["apply", "albedo(red)", "--normals", "normals.png", "--photo", "photo.png", "-o", "x.png"], "--photo and --from go together"),
@@ -139,6 +140,7 @@ def test_bad_input(
     monkeypatch.chdir(knot)
     normals, mask = scenes.knot(64)
     write_picture(knot / "small.png", normals * 0.5 + 0.5, mask)
+    write_picture(knot / "black.png", torch.zeros(3, 128, 128))
     (knot / "d.svg").write_text(SVG, encoding="utf-8")
     before = {path.name: path.read_bytes() for path in knot.iterdir()}
     capsys.readouterr()

@@ -100,12 +100,13 @@ def relight(
     for rotation in rotations:
         lit, sky = lights.turn(lit, rotation), lights.turn(sky, rotation)
     shown = sky if inset else None
+    pictures = turned(lit, frames, size, axis, shown) if turntable is not None else None
     if output is not None:
         write_tree(lit, output, [tree])
     if picture is not None:
         write_picture(picture, frame(lit, size, shown))
-    if turntable is not None:
-        write_turntable(turntable, turned(lit, frames, size, axis, shown), fps)
+    if turntable is not None and pictures is not None:
+        write_turntable(turntable, pictures, fps)
 
 
 VERBS = (relight,)

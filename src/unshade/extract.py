@@ -135,7 +135,7 @@ def from_mask(path: str | Path, mask: str | Path, *, ignore: str | Path | None =
     picture = read_picture(path)
     inside = read_mask(mask, picture, path) * _opacity(picture)
     rgb, exposure = _encoded(picture, inside > 0.5)
-    given = _Object(rgb, np.moveaxis(inflate(inside).numpy(), 0, -1), inside, "outline", {"exposure": exposure, "guess": True})
+    given = _Object(rgb, np.moveaxis(inflate(inside, mask).numpy(), 0, -1), inside, "outline", {"exposure": exposure, "guess": True})
     return _extract(path, given, _ignored(path, ignore, picture), size, even)
 
 
@@ -146,7 +146,7 @@ def from_drawing(path: str | Path, region: str, *, size: int = SIZE, even: bool 
         PictureError: no such drawing or shape. MissingExtraError: without the library that draws SVG.
     """
     shape = Drawing.read(path).lift(region)
-    normals = np.moveaxis(inflate(shape.alpha).numpy(), 0, -1)
+    normals = np.moveaxis(inflate(shape.alpha, f"{path}, region {region}").numpy(), 0, -1)
     return _extract(path, _Object(shape.rgb, normals, shape.alpha, f"drawing, region {region}", {"guess": True}), None, size, even)
 
 

@@ -6,6 +6,8 @@ the outline and makes a hemisphere of a disc. Its normal is ``(-h_x / 2, -h_y / 
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -21,11 +23,12 @@ STEPS = 400
 TOLERANCE = 1e-6
 
 
-def inflate(mask: Array | torch.Tensor) -> Normals:
+def inflate(mask: Array | torch.Tensor, path: str | Path = "mask") -> Normals:
     """Normals of a balloon with the outline of a mask.
 
     Args:
         mask: (H, W) in [0, 1], or (1, H, W); several separate parts are blown up each by itself.
+        path: what an error calls it.
     Returns:
         (3, H, W) float64 unit vectors, +x right, +y up, +z to the viewer; (0, 0, 1) outside.
     Raises:
@@ -34,7 +37,7 @@ def inflate(mask: Array | torch.Tensor) -> Normals:
     solid = np.asarray(mask, dtype=np.float64)
     solid = solid[0] if solid.ndim == 3 else solid
     if (solid > 0.5).sum() < 16:
-        raise PictureError(f"mask: expected a shape of at least 16 pixels, got {int((solid > 0.5).sum())}")
+        raise PictureError(f"{path}: expected a shape of at least 16 pixels, got {int((solid > 0.5).sum())}")
     factor = max(1, -(-max(solid.shape) // LARGEST))
     small = _shrunk(np.pad(solid, factor), factor)
     height = _height(small > 0.5)

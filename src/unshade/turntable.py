@@ -140,11 +140,13 @@ def turntable(tree: Tree, frames: int = 48, size: int = 256, axis: str = "vertic
         raise OutputError(
             f"{frames} frames of {size} x {size} are {frames * size * size:,} pixels, {MOST_PIXELS:,} at most; take fewer or smaller"
         )
-    for number in range(frames):
-        angles = [angle * number / frames for angle in AXES[axis]]
-        turned = [each if each is None or not number else relight(each, *angles) for each in (tree, lights)]
-        assert turned[0] is not None
-        yield frame(turned[0], size, turned[1])
+    return (_turned(tree, [angle * number / frames for angle in AXES[axis]], size, lights) for number in range(frames))
+
+
+def _turned(tree: Tree, angles: list[float], size: int, lights: Tree | None) -> Image:
+    if not any(angles):
+        return frame(tree, size, lights)
+    return frame(relight(tree, *angles), size, None if lights is None else relight(lights, *angles))
 
 
 def check_new_folder(folder: Path) -> None:
