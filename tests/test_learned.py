@@ -16,19 +16,20 @@ from typing import Any
 import pytest
 import torch
 
-from unshade import decoded, inference, learned, synthesis
+from unshade import decoded, inference, learned, search_depth, second_stage, synthesis
 from unshade.cli import run as run_command
 from unshade.decompose import Result, decompose, fit
 from unshade.errors import MissingWeightsError, TreeError
+from unshade.fit.pixels import Pixels
 from unshade.grammar import same_structure
-from unshade.inference import Inference, Networks, Part, Round, Terms, criterion, infer, node_image
+from unshade.inference import Inference, Networks, Part, Pool, Round, Terms, criterion, infer, node_image
 from unshade.models import weights
 from unshade.models.config import find
 from unshade.models.vqvae import Codes
 from unshade.nodes import Leaf, Node, Operator, Tree, leaf, mix, multiply, screen, walk
 from unshade.parameters import Layout
 from unshade.pictures import write_picture
-from unshade.proposals import arranged
+from unshade.proposals import Fits, arranged
 from unshade.render import evaluate, render
 from unshade.sphere import disc_mask, sphere_normals
 
@@ -328,6 +329,48 @@ def test_the_ablation_takes_parts_away(monkeypatch: pytest.MonkeyPatch) -> None:
     assert none.tree.leaves == 1 and none.stages is not None and none.stages["second_stage_share"] == 1.0
 
 
+def test_undoing_the_operators_gives_what_a_node_shows() -> None:
+    paint, shade, light = PAINTED.children[0].children[0], PAINTED.children[0].children[1], PAINTED.children[1]  # type: ignore[union-attr]
+    blank = torch.zeros(3, 8, 8)
+    codes = Codes(*[torch.zeros(1)] * 4)
+    root = Part(blank, codes, "operator", "split", 0, operator="screen", children=(1, 2))
+    body = Part(blank, codes, "operator", "split", 1, operator="multiply", children=(3, 4))
+    rest = Part(blank, codes, "operator", "left over", 1)
+    pool = Pool((root, body, rest, rest, rest))
+    true = {2: light, 3: paint, 4: shade}
+    pixels = Pixels.of(picture(PAINTED))
+    for place, node in true.items():
+        others = {other: node for other, node in true.items() if other != place}
+        found, gain = second_stage.wanted(pool, place, others, Fits(), pixels)
+        shown = render(node, found.normals[:, None])[:, 0]
+        assert (found.target - shown).abs().max() < 1e-3 and 0.1 < gain < 1.0
+        assert found.weight.sum().item() == pytest.approx(1.0, abs=1e-5)
+    hidden = {2: leaf("albedo", color=(1.0, 1.0, 1.0)), 4: shade}
+    assert second_stage.wanted(pool, 3, hidden, Fits(), pixels)[1] < second_stage.HIDDEN
+    assert second_stage.SecondStage(SimpleNamespace(samples=SimpleNamespace(coarse=pixels)), Fits()).in_place(pool, 3, hidden) is None  # type: ignore[arg-type]
+
+
+def test_looking_at_a_node_in_its_place_mends_what_was_decoded_badly(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Blurred(Oracle):
+        def __init__(self, root: Node) -> None:
+            super().__init__(root)
+            body = self.nodes.index(root.children[0])  # type: ignore[union-attr]
+            pale = 0.6 * self.images[body] + 0.2 * disc_mask(self.size)  # type: ignore[operator]
+            self.images[body] = torch.nn.functional.avg_pool2d(pale[None], 9, 1, 4)[0]
+
+    oracle: Any = Blurred(PAINTED)
+    monkeypatch.setattr(Networks, "load", lambda *_: oracle)
+    only = Inference(samples=1, depth=1, stop=10.0, trees=1)
+    found = [
+        decompose(
+            picture(PAINTED), method="learned", preset="draft", settings=learned.Settings(only, in_place=in_place, overall=False)
+        ).result()
+        for in_place in (False, True)
+    ]
+    assert all(result.stages is not None and result.stages["second_stage_nodes"] == 1 for result in found)
+    assert found[1].psnr > found[0].psnr + 5.0
+
+
 def test_a_hybrid_stops_where_a_proposal_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
     found = decomposed(SIMPLE, monkeypatch, method="hybrid")
     assert found.psnr > 50.0 and same_structure(found.tree, Tree(SIMPLE))
@@ -366,7 +409,7 @@ def test_the_largest_size_is_kept(tiny: Path) -> None:
 
 @pytest.mark.slow
 def test_the_papers_second_stage(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learned, "NODE_BUDGET", learned.search_depth.Budget(ranked=4, fitted=1, extended=1))
+    monkeypatch.setattr(second_stage, "NODE_BUDGET", search_depth.Budget(ranked=4, fitted=1, extended=1))
     settings = learned.Settings(dataclasses.replace(SETTINGS, stop=-1.0), second_stage="depth")
     found = decompose(picture(SIMPLE, 64), method="learned", weights=tiny, settings=settings, preset="draft").result()
     assert found.stages is not None and found.stages["second_stage_fits"] >= 5 and found.tree.leaves >= 1

@@ -27,7 +27,7 @@ from unshade.sphere import sphere_normals
 from unshade.starts import read_off
 
 if TYPE_CHECKING:
-    from unshade.learned import Hybrid, Learned, SecondStage, Settings
+    from unshade.learned import Hybrid, Learned, SecondStageName, Settings
 
 METHODS = ("search", "learned", "hybrid")
 """Who proposes structures: the search, networks alone as in the paper, or networks and the search together."""
@@ -159,7 +159,7 @@ def decompose(
     search: Literal["size", "depth"] = "size",
     objective: Literal["l2", "paper"] = "l2",
     method: Literal["search", "learned", "hybrid"] = "search",
-    second_stage: SecondStage = "size",
+    second_stage: SecondStageName = "size",
     weights: str | Path | None = None,
     settings: Settings | None = None,
 ) -> Decomposition:
@@ -305,7 +305,7 @@ def _learned(
     sphere: SphereImage,
     method: Literal["learned", "hybrid"],
     seed: int,
-    second_stage: SecondStage,
+    second_stage: SecondStageName,
     objective: Literal["l2", "paper"],
     weights: str | Path | None,
     settings: Settings | None,

@@ -128,6 +128,10 @@ class Growth:
         """Lower is better."""
         return math.log(error + FLOOR) + self.effort.price * values
 
+    def judged(self, candidate: Candidate) -> float:
+        """`judge` of a candidate."""
+        return self.judge(candidate.error, candidate.values)
+
     def start(self) -> Node:
         """The mean colour."""
         pixels = self.samples.coarse

@@ -171,6 +171,15 @@ class Pool:
         """Places of the parts that a second stage has to look at."""
         return [place for place, part in enumerate(self.parts) if part.state == "left over"]
 
+    def way(self, place: int) -> list[tuple[int, int]]:
+        """From the root down to a part: the places of (a node, its child on the way)."""
+        above = {child: number for number, part in enumerate(self.parts) for child in part.children or ()}
+        found: list[tuple[int, int]] = []
+        while place:
+            found.append((above[place], place))
+            place = above[place]
+        return found[::-1]
+
     def loss(self, stop: float) -> float:
         """Sum of the criterion over its nodes; smaller trees lose less."""
         split = [part.terms.select for part in self.parts if part.state == "split" and part.terms]

@@ -1,9 +1,10 @@
 """The methods that networks propose trees for: the paper's (`Learned`), and the search that starts from several proposals (`Hybrid`).
 
-`Learned` is the paper's pipeline: the first stage (`inference`), a second stage for the nodes left over, the parametric fit
-of every leaf, the optimisation of the whole tree. Deviations from the paper, beyond those of `inference`:
+`Learned` is the paper's pipeline: the first stage (`inference`), a second stage for the nodes left over (`second_stage`), the parametric
+fit of every leaf, the optimisation of the whole tree. Deviations from the paper, beyond those of `inference`:
 
 - the fits are second order on pixels, not BasinCMA on pixels and VGG features; ``second_stage="depth"`` is the paper's own;
+- nodes that were left over are looked at twice, the second time in their place (``in_place``);
 - an environment is a few lights, not a raster, and a mask a circle or a band, so that the tree is parametric and small;
 - products and screens are flattened, an albedo stands once in each, and a tree over the largest size loses its least useful leaves.
 
@@ -17,36 +18,23 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Literal
 
-import torch
-
-from unshade import search_depth
-from unshade.atoms import dictionary_of
 from unshade.changes import removals, swaps
-from unshade.decoded import SIZE
-from unshade.fit.basin_cma import fit_basin_cma
-from unshade.fit.gradient import fit_gradient
 from unshade.fit.least_squares import FINE_SOFTNESS, error_of, fit_pixels
 from unshade.fit.model import soften
 from unshade.fit.pixels import Pixels
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
-from unshade.inference import Inference, Networks, Part, Pool, Round, infer, node_image
+from unshade.inference import Inference, Networks, Pool, Round, infer, node_image
 from unshade.nodes import Node, count_values
 from unshade.proposals import Fits
 from unshade.search import Search
 from unshade.search_drawn import DRAWN, SETTLED, settled
-from unshade.sphere import disc_mask
+from unshade.second_stage import SecondStage, SecondStageByDepth
 from unshade.types import Image, Mask
 
-NODE_EFFORT = Effort(24, price=0.02, beam=0, trials=3, rounds=0, sweeps=0, polish_steps=10)
-"""Of the second stage by size on one node: its picture is decoded from codes, so small gains are noise."""
-
-NODE_THRESHOLD = 0.03
-"""The paper's phi, root mean square, of the second stage by depth on one node: what a decoded picture is wrong by."""
-
-NODE_BUDGET = search_depth.Budget(ranked=60, fitted=4, extended=4)
+PLACED_STEPS = 6
+"""Second-order steps of the whole tree before two trees of a node are compared."""
 
 WHOLE_STEPS = 40
 """Most second-order steps of the whole tree on each set of pixels."""
@@ -57,7 +45,7 @@ SURVIVORS = 2
 OFFERED = 4
 """Changes of a proposal that are looked at closely."""
 
-SecondStage = Literal["size", "depth", "none"]
+SecondStageName = Literal["size", "depth", "none"]
 
 
 @dataclass(frozen=True)
@@ -65,9 +53,11 @@ class Settings:
     """Of the learned methods; the parts that an ablation turns off are here."""
 
     inference: Inference = field(default_factory=Inference)
-    second_stage: SecondStage = "size"
+    second_stage: SecondStageName = "size"
     """How nodes that were left over are decomposed: our search by size, the paper's search by depth (a minute or more a node),
     or not at all: each becomes one colour."""
+    in_place: bool = True
+    """Look at nodes that were left over a second time, in their place in the tree (`second_stage`); the paper does not."""
     overall: bool = True
     """Optimise the whole tree at the end."""
     objective: Literal["l2", "paper"] = "l2"
@@ -164,9 +154,15 @@ class Learned(Growth):
         self, image: Image, valid: Mask, samples: Samples, effort: Effort, networks: Networks, settings: Settings, seed: int
     ) -> None:
         super().__init__(samples, effort)
-        self.image, self.valid, self.settings, self.seed = image, valid, settings, seed
+        self.settings = settings
         self.stages = Stages("learned")
         self.proposing = _Proposing(image, valid, networks, settings, seed, self.stages)
+        fits = self.proposing.fits
+        self.second = (
+            SecondStageByDepth(self, fits, image, valid, settings.objective, seed)
+            if settings.second_stage == "depth"
+            else SecondStage(self, fits)
+        )
 
     def run(self) -> Iterator[tuple[str, Candidate]]:
         """(stage, candidate) as they come."""
@@ -178,19 +174,41 @@ class Learned(Growth):
         finished = []
         for pool in self.proposing.pools:
             second: dict[int, Node] = {}
-            for place in pool.left_over if self.settings.second_stage != "none" else []:
-                with self.stages.clock("second stage"):
-                    second[place] = self._second_stage(pool.parts[place], place == 0, self._room(pool))
-                best = min(best, self._rough(self.proposing.tree(pool, second)), key=lambda candidate: candidate.error)
+            for rough in self._second_stage(pool, second) if self.settings.second_stage != "none" else ():
+                best = min(best, rough, key=lambda candidate: candidate.error)
                 yield "second stage", best
             root = self.proposing.tree(pool, second)
             with self.stages.clock("whole tree"):
                 finished.append((self._finished(root), pool))
-        chosen, pool = min(finished, key=lambda entry: self.judge(entry[0].error, entry[0].values))
+        chosen, pool = min(finished, key=lambda entry: self.judged(entry[0]))
         self.stages.chosen(pool)
+        self.stages.second_stage_fits = self.second.count
         yield "whole tree", chosen
         with self.stages.clock("family"):
             self._smaller(chosen)
+
+    def _second_stage(self, pool: Pool, second: dict[int, Node]) -> Iterator[Candidate]:
+        """Decompose what was left over, into ``second``; the tree after each node."""
+        for place in pool.left_over:
+            with self.stages.clock("second stage"):
+                second[place] = self.second.decompose(pool, place, second)
+            yield self._rough(self.proposing.tree(pool, second))
+        if not self.settings.in_place or not any(second):
+            return
+        best = self._placed(pool, second)
+        for place in pool.left_over:
+            with self.stages.clock("second stage"):
+                found = self.second.in_place(pool, place, second)
+                if found is None:
+                    continue
+                other = self._placed(pool, second | {place: found})
+            if self.judged(other) < self.judged(best):
+                best, second[place] = other, found
+                yield self._rough(self.proposing.tree(pool, second))
+
+    def _placed(self, pool: Pool, second: dict[int, Node]) -> Candidate:
+        """The tree of a pool after a short fit."""
+        return self.fit(self.proposing.tree(pool, second), self.samples.coarse, PLACED_STEPS)
 
     def _rough(self, root: Node) -> Candidate:
         """A tree as it is."""
@@ -216,45 +234,6 @@ class Learned(Growth):
             root = least_useful(current.root, self.samples.points)
             current = self.fit(root, self.samples.points, self.effort.growth_steps) if root is not None else None
 
-    def _room(self, pool: Pool) -> int:
-        """Values for each node that was left over, so that the tree stays within its size; 3 at least, one colour."""
-        share = (self.effort.max_values - count_values(self.proposing.tree(pool))) // max(len(pool.left_over), 1)
-        return max(3 + share, 3)
-
-    def _second_stage(self, part: Part, is_root: bool, room: int) -> Node:
-        """Decompose a node that was left over: the picture itself where it is the root, else what was decoded."""
-        if self.settings.second_stage == "depth":
-            image, valid = (self.image, self.valid) if is_root else (part.image.cpu(), disc_mask(part.image.shape[-1]))
-            return self._by_depth(image, valid, room, is_root)
-        # Of the picture itself: grown, but not looked at as a drawing, which would be the search in the place of the networks.
-        samples, effort = self.samples, dataclasses.replace(self.effort, beam=0, rounds=0)
-        if not is_root:
-            pixels = Pixels.of(part.image.cpu(), None, SIZE)
-            samples = Samples(pixels, pixels, pixels, dictionary_of(pixels), dictionary_of(pixels))
-            effort = dataclasses.replace(NODE_EFFORT, max_values=min(room, NODE_EFFORT.max_values))
-        steps = [found for _, found in Search(samples, effort).run()]
-        self.stages.second_stage_fits += len(steps)
-        return steps[-1].root
-
-    def _by_depth(self, image: Image, valid: Mask, room: int, is_root: bool) -> Node:
-        """The paper's second stage: structures in order of depth, BasinCMA."""
-        found, fits = self.start(), 0
-        with torch.inference_mode(False):
-            for progress in search_depth.search(
-                image.clone(),
-                valid.clone(),
-                partial(fit_basin_cma, objective=self.settings.objective, meta_steps=6, gradient_steps=10, final_steps=150),
-                0.01 if is_root else NODE_THRESHOLD,
-                seed=self.seed,
-                rank=partial(fit_gradient, size=20, steps=50, restarts=3),
-                budget=NODE_BUDGET,
-                max_values=room,
-            ):
-                found = progress.root
-                fits = progress.done
-        self.stages.second_stage_fits += fits
-        return found
-
 
 class Hybrid(Search):
     """Networks propose several trees, parameters included; the search finishes them, and one of its own, side by side.
@@ -279,7 +258,7 @@ class Hybrid(Search):
             trees = [(self._proposed(pool), pool) for pool in found.pools]
             best = min([best, *(candidate for candidate, _ in trees)], key=lambda candidate: candidate.error)
             yield "propose", best
-        survivors = sorted(trees, key=lambda entry: self.judge(entry[0].error, entry[0].values))[:SURVIVORS]
+        survivors = sorted(trees, key=lambda entry: self.judged(entry[0]))[:SURVIVORS]
         self.stages.chosen(survivors[0][1])
         finished: list[Candidate] = []
         for proposed, pool in survivors:
@@ -295,14 +274,11 @@ class Hybrid(Search):
             results = [found_]
         for current in finished:
             for current in self.grow(current, self.samples.points, self.samples.points_dictionary, FLOOR, self.families):
-                yield "grow", min([current, *results], key=self._judged)
+                yield "grow", min([current, *results], key=self.judged)
             for _ in range(self.effort.sweeps):
                 current = self._sweep(current, self.samples.points)
             results.append(self.sharpen(current))
-        yield "polish", min(results, key=self._judged)
-
-    def _judged(self, candidate: Candidate) -> float:
-        return self.judge(candidate.error, candidate.values)
+        yield "polish", min(results, key=self.judged)
 
     def _proposed(self, pool: Pool) -> Candidate:
         """The tree of a pool, fitted to the coarse averages."""

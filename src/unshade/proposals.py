@@ -32,12 +32,20 @@ class Fits:
             self._known[id(part)] = part, found
         return self._known[id(part)][1]
 
-    def tree(self, pool: Pool, second: Mapping[int, Node] | None = None) -> Node:
-        """The tree of a pool.
+    def mask(self, pool: Pool, place: int) -> Leaf:
+        """The mask of a part that is a mix."""
+        part = pool.parts[place]
+        assert part.children is not None
+        left, right = part.children
+        return self._of(part, (pool.parts[left], pool.parts[right]))
+
+    def tree(self, pool: Pool, second: Mapping[int, Node] | None = None, place: int = 0) -> Node:
+        """The tree of a pool, or of one of its parts.
 
         Args:
             second: what a second stage found for parts that were left over, by their place. Others, and open parts, are
                 one colour each.
+            place: of the part on top.
         """
         second = second or {}
 
@@ -49,10 +57,10 @@ class Fits:
                 return self._of(part, None)
             left, right = part.children
             assert part.operator is not None
-            mask = self._of(part, (pool.parts[left], pool.parts[right])) if part.mask is not None else None
+            mask = self.mask(pool, place) if part.mask is not None else None
             return Operator(part.operator, (node(left), node(right)), mask)
 
-        return arranged(node(0))
+        return arranged(node(place))
 
 
 def arranged(root: Node) -> Node:

@@ -53,7 +53,7 @@ class Search(Growth):
             current = yield from self._with_environment(current, plain)
         if current is not plain and looks_drawn(current):
             current = drawn.prune(current)
-        if plain is not None and self.judge(plain.error, plain.values) < self.judge(current.error, current.values):
+        if plain is not None and self.judged(plain) < self.judged(current):
             current = plain
         return current
 
@@ -67,7 +67,7 @@ class Search(Growth):
             yield "swap", current
         for number in range(self.effort.rounds):
             better = self._exchange(current, number)
-            if self.judge(better.error, better.values) < self.judge(current.error, current.values):
+            if self.judged(better) < self.judged(current):
                 current = better
                 yield "exchange", current
         return self.sharpen(current)
@@ -76,7 +76,7 @@ class Search(Growth):
         """The tree of the released grammar with an environment, if that is better."""
         drawn = ReflectingSearch(self.samples, self.effort, is_edged(current, plain))
         found = yield from drawn.run(self.rough.members())
-        if found is None or self.judge(found.error, found.values) >= self.judge(current.error, current.values):
+        if found is None or self.judged(found) >= self.judged(current):
             return current
         self.front.update(drawn.front)
         self.rough.update(drawn.rough)
@@ -86,16 +86,16 @@ class Search(Growth):
         """Offer every leaf another kind, or none at all, until nothing pays."""
         current = self.fit(current.root, pixels, self.effort.growth_steps)
         for _ in range(self.effort.sweep_steps):
-            score = self.judge(current.error, current.values)
+            score = self.judged(current)
             options = []
             for root in removals(current.root) + swaps(current.root):
                 if count_values(root) <= min(current.values + 2, self.effort.max_values):
                     quick = fit_pixels(pixels, root, steps=2, softest=FINE_SOFTNESS)
                     options.append(Candidate(quick.root, quick.error))
-            options.sort(key=lambda option: self.judge(option.error, option.values))
+            options.sort(key=self.judged)
             tried = [self.fit(option.root, pixels, self.effort.growth_steps) for option in options[:3]]
-            best = min(tried, key=lambda option: self.judge(option.error, option.values), default=current)
-            if self.judge(best.error, best.values) > score - 1e-4:
+            best = min(tried, key=self.judged, default=current)
+            if self.judged(best) > score - 1e-4:
                 return current
             current = best
         return current

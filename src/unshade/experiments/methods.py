@@ -1,7 +1,8 @@
 """The methods of the experiments by name.
 
 - ``cnn``, ``lstm``, ``transformer``: the baselines; with ``+fit`` our fit of the whole tree goes over what they found.
-- ``learned``: the paper's method; ``learned:base``, ``learned:samples``, ``learned:second`` and ``learned:full`` are its ablation;
+- ``learned``: the paper's method; ``learned:base``, ``learned:samples``, ``learned:second``, ``learned:overall`` and
+  ``learned:full`` are its ablation;
   ``learned:alone`` has no second stage, ``learned:depth`` the paper's own, minutes a picture.
 - ``search:PRESET``, ``hybrid:PRESET``: ours.
 """
@@ -30,13 +31,15 @@ NETWORKS = ("learned", "hybrid")
 VARIANTS: dict[str, Settings] = {
     "base": Settings(Inference(samples=1), second_stage="none", overall=False),
     "samples": Settings(second_stage="none", overall=False),
-    "second": Settings(overall=False),
+    "second": Settings(in_place=False, overall=False),
+    "overall": Settings(in_place=False),
     "full": Settings(),
     "alone": Settings(second_stage="none"),
     "depth": Settings(second_stage="depth"),
 }
-"""Of ``learned``: one sample; several; the second stage; all, which is the method; all but the second stage, so that no search helps the
-networks; all with the paper's second stage."""
+"""Of ``learned``: one sample; several; the second stage; the optimisation of the whole tree, which makes the paper's method; a second look
+at nodes in their place, which is ours and the default. ``alone`` is all but the second stage, so that no search helps the networks;
+``depth`` has the paper's second stage."""
 
 FIT = "+fit"
 
