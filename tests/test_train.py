@@ -244,4 +244,4 @@ def test_two_processes_learn_together(tmp_path: Path) -> None:
 
 def test_the_model_card_is_of_the_weights_that_ship() -> None:
     path = Path(__file__).resolve().parent.parent / "docs" / "model-card.md"
-    assert path.read_text(encoding="utf-8") == model_card.page(weights.FOLDER)
+    assert path.read_text(encoding="utf-8") == model_card.page(weights.FOLDER, weights.BASELINE_FOLDER)

@@ -54,7 +54,8 @@ STYLES = ("realistic", "toon")
 HEAD = """# Model card
 
 The weights that ship with `unshade`, written by `unshade train all` and read by the learned method. This page is made from what
-stands in the files (`scripts/model_card.py`). Safetensors, parameters in half precision; how they were trained: [training](training.md).
+stands in the files (`scripts/model_card.py`). Safetensors, parameters in half precision; how they were trained: [training](training.md). The baselines, which nothing
+but the [experiments](experiments.md) reads, are not in the package; they lie in `benchmarks/weights` of the repository.
 
 Made for node images of shade trees: synthetic shaded spheres of the released grammar and wider ones, black outside the disc. Figures
 are of nodes from the test half of the data, whose colours, directions, masks and environment maps occur in no training tree. Photographs
@@ -62,9 +63,10 @@ of real spheres are another distribution, and nothing here says how well it goes
 """
 
 
-def page(folder: Path) -> str:
-    """The card of all weights in a folder, as Markdown. Raises MissingWeightsError, WeightsError."""
-    return HEAD + "".join(_section(name, folder) for name in TITLES | BASELINES if weights.file_of(name, folder).is_file())
+def page(*folders: Path) -> str:
+    """The card of all weights in some folders, as Markdown. Raises MissingWeightsError, WeightsError."""
+    sections = [(name, folder) for folder in folders for name in TITLES | BASELINES if weights.file_of(name, folder).is_file()]
+    return HEAD + "".join(_section(name, folder) for name, folder in sections)
 
 
 def write_card(folder: Path) -> Path:

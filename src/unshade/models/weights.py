@@ -1,6 +1,7 @@
 """Weights in files: safetensors with the configuration and a card in the header. Nothing is unpickled.
 
-Parameters are stored in half precision, codebooks as they are. The files that ship lie in ``unshade/weights``.
+Parameters are stored in half precision, codebooks as they are. The files that ship lie in ``unshade/weights``, those of the baselines in
+``benchmarks/weights`` of the repository.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ from unshade.models.vqvae import VQVAE
 FOLDER = Path(__file__).resolve().parent.parent / "weights"
 """Of the weights that ship with the package."""
 
+BASELINE_FOLDER = FOLDER.parents[2] / "benchmarks" / "weights"
+"""Of the baselines, in a checkout of the repository: five times the size of the package's, and nothing but the experiments reads them."""
+
 MODELS: dict[str, Callable[[Config], nn.Module]] = {"vqvae": VQVAE, "prior": Priors, "heads": Heads}
 """What the learned method needs; the name of a file is that of its training task."""
 
@@ -59,7 +63,7 @@ def file_of(name: str, folder: str | os.PathLike[str] | None = None) -> Path:
     """Where the weights of a model lie, whether they do or not."""
     if name not in _ALL:
         raise WeightsError(f"unknown model {name!r}{did_you_mean(name, _ALL)}")
-    return Path(folder or FOLDER) / f"{name}.safetensors"
+    return Path(folder or (BASELINE_FOLDER if name in BASELINES else FOLDER)) / f"{name}.safetensors"
 
 
 def available(folder: str | os.PathLike[str] | None = None) -> bool:
@@ -107,7 +111,7 @@ def load(name: str, folder: str | os.PathLike[str] | None = None, device: torch.
 
     Args:
         name: vqvae, prior, heads, cnn, lstm or transformer.
-        folder: of the weight files; None for those that ship.
+        folder: of the weight files; None for those of the project.
     Raises:
         MissingWeightsError: there is no such file. WeightsError: it is damaged or of another model.
     """
