@@ -54,8 +54,9 @@ STYLES = ("realistic", "toon")
 HEAD = """# Model card
 
 The weights that ship with `unshade`, written by `unshade train all` and read by the learned method. This page is made from what
-stands in the files (`scripts/model_card.py`). Safetensors, parameters in half precision; how they were trained: [training](training.md). The baselines, which nothing
-but the [experiments](experiments.md) reads, are not in the package; they lie in `benchmarks/weights` of the repository.
+stands in the files (`scripts/model_card.py`). Safetensors, parameters in half precision; how they were trained: [training](training.md).
+The baselines, which nothing but the [experiments](experiments.md) reads, are not in the package; they lie in `benchmarks/weights` of the
+repository.
 
 Made for node images of shade trees: synthetic shaded spheres of the released grammar and wider ones, black outside the disc. Figures
 are of nodes from the test half of the data, whose colours, directions, masks and environment maps occur in no training tree. Photographs

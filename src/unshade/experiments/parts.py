@@ -33,6 +33,9 @@ ANALOGIES = 300
 POOL = 40
 """Known trees of each style, which the analogies draw from."""
 
+PLAIN = "all, no environment map"
+"""Analogies of four trees that reflect nothing: a parametric tree shows a reflected photo as a few lights at most."""
+
 CHANGED = 35.0
 """An analogy is only asked where the component changes both pictures by more than this, dB."""
 
@@ -157,6 +160,8 @@ def analogy(context: Context) -> tuple[Document, list[Row]]:
         for (method, component), own in groups(rows, "method", "component").items()
     ]
     tables += [{"method": method, "component": "all", **_judged(own)} for (method,), own in groups(rows, "method").items()]
+    plain = [row for row in rows if not row["with_environment"]]
+    tables += [{"method": method, "component": PLAIN, **_judged(own)} for (method,), own in groups(plain, "method").items()]
     about = [
         {"method": method, "dataset": dataset, **figures(own)} for (method, dataset), own in groups(pictures, "method", "dataset").items()
     ]

@@ -12,7 +12,7 @@ from unshade.analogy import Seen, explain
 from unshade.bench.measures import decibels
 from unshade.components import Component
 from unshade.errors import TreeError
-from unshade.experiments.pieces import swapped
+from unshade.experiments.pieces import pieces, swapped
 from unshade.experiments.subjects import pool, shown
 from unshade.nodes import Tree
 from unshade.pictures import SIZE
@@ -43,10 +43,11 @@ def truths(question: Question, seed: int) -> tuple[Tree, ...]:
 
 def understood(question: Question, seed: int, perceptual: bool) -> dict[str, Any]:
     """The row of an analogy. A method whose trees cannot be edited so gives P back unchanged."""
-    a, _, _, _, ab, answer = truths(question, seed)
+    a, b, p, q, ab, answer = truths(question, seed)
     found_a, found_b, found_p, found_q = (serde.loads(tree) for tree in question.found)
     disc, scored = disc_mask(SIZE), disc_mask(SIZE, SCORED_RADIUS)
     row: dict[str, Any] = {"component": question.component, "understood": None, "pool": question.dataset, "numbers": list(question.numbers)}
+    row["with_environment"] = any((pieces(tree) or {}).get(Component.ENVIRONMENT) for tree in (a, b, p, q))
     done = found_p
     try:
         scores = explain(Seen(shown(a), disc, found_a), found_b, shown(ab), disc)
