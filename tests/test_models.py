@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from unshade.errors import MissingWeightsError
-from unshade.models import heads, weights
+from unshade.models import heads, pixelsnail, weights
 from unshade.models.config import CONFIGS, Config, ConfigError, find
 from unshade.models.pixelsnail import PixelSNAIL
 from unshade.models.prior import Priors, repeat
@@ -118,8 +118,9 @@ def test_a_logit_sees_only_codes_before_it() -> None:
         assert differs.tolist() == [k > position for k in range(16)]
 
 
-@pytest.mark.parametrize("temperature", [1.0, 0.5, 0.0])
-def test_sampling_with_the_cache_draws_the_same_codes(temperature: float) -> None:
+@pytest.mark.parametrize(("temperature", "at_once"), [(1.0, 128), (1.0, 4), (0.5, 128), (0.0, 128)])
+def test_sampling_with_the_cache_draws_the_same_codes(temperature: float, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pixelsnail, "AT_ONCE", at_once)
     vqvae, priors = made_vqvae(), Priors(DRAWN).eval()
     parent = vqvae.encode(torch.rand(2, 3, 16, 16))
     drawn = [priors.sample_children(vqvae, parent, 3, torch.Generator().manual_seed(5), temperature, cached) for cached in (True, False)]
