@@ -36,6 +36,8 @@ operator, nesting and mask) against it. What a target cannot hold is said by `ex
 standard error, with the nodes it happens to and what becomes of them. A target is *experimental* until a program of its own world has
 read it in the tests.
 
+What the last column of the table names comes with `pip install 'unshade[export]'` (psd-tools, pikepdf, svgelements) or `'unshade[exr]'` (OpenEXR).
+
 ## Targets
 
 """
@@ -107,8 +109,8 @@ def measured() -> str:
         rows.append(f"| {name} | {' | '.join(cells)} | {found['bytes'] / 1000:.0f} KB |")
     about = (
         f"Measured by `scripts/measure_exports.py` inside 0.97 of the radius: the lowest PSNR over the {numbers['trees']} fixture trees "
-        "that work on encoded values, at 256 pixels against `render` averaged over 4 x 4 places a pixel; and a tree of 63 values that "
-        "`decompose` found in `examples/red_lacquer.png`, against `render` itself.\n\n"
+        "that work on\nencoded values, at 256 pixels against `render` averaged over 4 x 4 places a pixel; and a tree of 63 values that "
+        "`decompose`\nfound in `examples/red_lacquer.png`, against `render` itself.\n\n"
     )
     head = "| target, program | lowest of the fixture trees | found tree at 512 | at 2048 | size |\n|---|---|---|---|---|\n"
     return about + head + "\n".join(rows) + "\n"

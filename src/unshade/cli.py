@@ -95,7 +95,7 @@ def cli(context: click.Context) -> None:
     type=click.Choice(["draft", "balanced", "best"]),
     default="balanced",
     show_default=True,
-    help="Up to 30, 64 or 160 values; about half a second, 2 or 10 seconds of two cores a picture.",
+    help="Up to 30, 64 or 160 values; about 0.3, 2 or 10 seconds of one core a picture.",
 )
 @click.option("--max-values", type=click.IntRange(3), metavar="N", help="Largest tree, in stored values, instead of the preset's.")
 @click.option(
