@@ -19,7 +19,7 @@ help:
 	@echo "make format  lay out the code and sort its imports"
 	@echo "make fast    the tests without the slow ones"
 	@echo "make bench   data sets x methods; writes benchmarks/ (absent data sets are skipped by name)"
-	@echo "make docs    regenerate the gallery, the page about the data, the CLI reference and the pictures of the README"
+	@echo "make docs    regenerate the pages that scripts write, and their pictures"
 	@echo "make clean   remove what the above made"
 
 # Two stamps, so that a second run installs nothing: what a user needs, and what a developer needs on top.
