@@ -36,7 +36,8 @@ operator, nesting and mask) against it. What a target cannot hold is said by `ex
 standard error, with the nodes it happens to and what becomes of them. A target is *experimental* until a program of its own world has
 read it in the tests.
 
-What the last column of the table names comes with `pip install 'unshade[export]'` (psd-tools, pikepdf, svgelements) or `'unshade[exr]'` (OpenEXR).
+What the last column of the table names comes with `pip install 'unshade[export]'` (psd-tools, pikepdf, svgelements) or
+`'unshade[exr]'` (OpenEXR).
 
 ## Targets
 
