@@ -67,6 +67,7 @@ docs: $(VENV)/.dev
 	@$(PY) scripts/cli_reference.py
 	@$(PY) scripts/export_page.py
 	@$(PY) scripts/export_gallery.py
+	@$(PY) scripts/editing_picture.py
 	@$(PY) scripts/readme_picture.py
 
 clean:

@@ -172,7 +172,7 @@ def decompose(
         seed: of everything drawn at random. The same seed gives the same tree, bit for bit.
         alternatives: how many structurally different trees of about one size are wanted, the chosen one among them.
         search: ``size`` grows trees leaf by leaf; ``depth`` is the paper's second stage, structures in order of depth
-            fitted by BasinCMA, and takes minutes.
+            fitted by BasinCMA, and takes about half a minute.
         objective: of ``depth``: ``l2`` compares pixels, ``paper`` pixels and VGG features, a hundred times slower.
         method: who proposes structures: the ``search`` alone; ``learned``, networks alone as in the paper; ``hybrid``,
             networks whose trees the search finishes. Without weights the hybrid is the search, and `Result.stages` says so.

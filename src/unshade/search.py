@@ -18,7 +18,7 @@ ALL = ("lights", "masks", "shades", "spots", "rims", "environments")
 
 LATE = frozenset({"rims", "environments"})
 """Families that come only where `Effort.late` asks for them, and once a tree is good: early they take over form, which belongs
-to the diffuse part,."""
+to the diffuse part."""
 
 
 class Search(Growth):
