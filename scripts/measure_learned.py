@@ -124,7 +124,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--methods", default="search;search, more;learned told;hybrid told;learned;hybrid")
-    parser.add_argument("--json", type=Path, default=Path("benchmarks/learned.json"))
+    parser.add_argument("--json", type=Path, default=Path("benchmarks/results/learned.json"))
     args = parser.parse_args()
     torch.set_num_threads(1)
     PRESETS["more"] = dataclasses.replace(PRESETS["balanced"], name="more", effort=MORE)
