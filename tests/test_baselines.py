@@ -175,6 +175,14 @@ def test_all_are_about_as_large_as_the_learned_method(name: str) -> None:
     assert all(0.9 < one / learned < 1.1 for one in size(weights.BASELINES))
 
 
+@pytest.mark.parametrize("name", [*weights.BASELINES])
+def test_the_trained_baselines_see_something(name: str) -> None:
+    root = multiply(leaf("albedo", color=(0.8, 0.3, 0.2)), leaf("diffuse", direction=(0.3, 0.5, 0.8)))
+    picture = render(root, sphere_normals(64))
+    found = baselines.Baseline.load(name).tree(SphereImage(picture, disc_mask(64), Disc(32.0, 32.0, 32.0, 1.0)))
+    assert psnr(render(found, sphere_normals(64)), picture, disc_mask(64)) > psnr(torch.zeros_like(picture), picture, disc_mask(64))
+
+
 def test_mistakes_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(UnshadeError, match="did you mean 'lstm'"):
         baselines.Baseline.load("lstn")

@@ -228,6 +228,7 @@ def test_the_true_trees_understand_every_analogy() -> None:
         found = tuple(serde.dumps(tree) for tree in parts.truths(question, 0)[:4])
         row = understood(dataclasses.replace(question, found=found), 0, False)
         assert row["right"] and row["psnr"] > 45.0
+        assert row["with_environment"] == any("environment" in tree for tree in found)
 
 
 def test_test_trees_do_not_depend_on_how_many_are_asked_for() -> None:

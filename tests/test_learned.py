@@ -350,6 +350,14 @@ def test_undoing_the_operators_gives_what_a_node_shows() -> None:
     assert second_stage.SecondStage(SimpleNamespace(samples=SimpleNamespace(coarse=pixels)), Fits()).in_place(pool, 3, hidden) is None  # type: ignore[arg-type]
 
 
+def test_a_node_that_shows_little_of_itself_gets_few_values() -> None:
+    stage = second_stage.SecondStage(SimpleNamespace(), Fits())  # type: ignore[arg-type]
+    pixels = Pixels.of(picture(PAINTED), None, 40)
+    sizes = [Tree(stage._of_node(pixels, gain)).values for gain in (0.01, 0.25, 1.0)]
+    most = second_stage.NODE_EFFORT.max_values
+    assert sizes[0] == 3 < sizes[1] <= most / 2 < sizes[2] <= most
+
+
 def test_looking_at_a_node_in_its_place_mends_what_was_decoded_badly(monkeypatch: pytest.MonkeyPatch) -> None:
     class Blurred(Oracle):
         def __init__(self, root: Node) -> None:

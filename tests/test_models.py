@@ -132,6 +132,15 @@ def test_sampling_with_the_cache_draws_the_same_codes(temperature: float, at_onc
         assert drawn[0][0].bottom.unique().numel() > 4
 
 
+def test_codes_are_drawn_as_often_as_they_are_likely() -> None:
+    likely = torch.tensor([0.0, 0.5, 0.0, 0.3, 0.2, 0.0])
+    drawn = pixelsnail._draw(likely.log().expand(20_000, -1), torch.Generator().manual_seed(1), 1.0)
+    assert torch.allclose(drawn.bincount(minlength=6) / 20_000, likely, atol=0.02)
+    assert set(drawn.tolist()) == {1, 3, 4}
+    sharper = pixelsnail._draw(likely.log().expand(20_000, -1), torch.Generator().manual_seed(1), 0.5)
+    assert torch.allclose(sharper.bincount(minlength=6) / 20_000, likely.square() / likely.square().sum(), atol=0.02)
+
+
 def test_samples_of_one_parent_stand_in_a_row() -> None:
     codes = made_vqvae().encode(torch.rand(2, 3, 16, 16))
     assert torch.equal(repeat(codes, 3).top[3:], codes.top[1:].expand(3, -1, -1))

@@ -2,8 +2,7 @@
 
 - ``cnn``, ``lstm``, ``transformer``: the baselines; with ``+fit`` our fit of the whole tree goes over what they found.
 - ``learned``: the paper's method; ``learned:base``, ``learned:samples``, ``learned:second``, ``learned:overall`` and
-  ``learned:full`` are its ablation;
-  ``learned:alone`` has no second stage, ``learned:depth`` the paper's own, minutes a picture.
+  ``learned:full`` are its ablation; ``learned:alone`` has no second stage, ``learned:depth`` the paper's own, minutes a picture.
 - ``search:PRESET``, ``hybrid:PRESET``: ours.
 """
 

@@ -86,13 +86,22 @@ def run(options: Options, console: Console | None = None) -> Ran:
         head |= {"weights": methods.cards(iter(able), options.weights), "skipped": ran.skipped | context.skipped, "failed": failed}
         ran.documents[part] = head | document
         ran.failed += failed
-        _write(options.results / f"{part}.json", json.dumps(ran.documents[part], indent=1) + "\n")
+        _write(options.results / f"{part}.json", _lines(ran.documents[part]))
         if part in sheets.SHEETS:
             sheets.SHEETS[part](options, rows)
         _draw(lambda part=part: _plot(options, part, ran.documents[part]), tell)  # type: ignore[misc]
         _learning(options, tell)
         write_page(options)
     return ran
+
+
+def _lines(document: Document) -> str:
+    """JSON with a line for each entry of a list, so that thousands of rows are not a hundred thousand lines."""
+    fields = []
+    for name, value in document.items():
+        text = "[\n" + ",\n".join(json.dumps(entry) for entry in value) + "\n]" if isinstance(value, list) and value else json.dumps(value)
+        fields.append(f"{json.dumps(name)}: {text}")
+    return "{\n" + ",\n".join(fields) + "\n}\n"
 
 
 def _perceptual(options: Options, ran: Ran) -> bool:
