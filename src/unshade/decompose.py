@@ -6,7 +6,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,6 +24,7 @@ from unshade.render import render, srgb_decode
 from unshade.search import Search
 from unshade.sphere import sphere_normals
 from unshade.starts import read_off
+from unshade.threads import threads
 
 if TYPE_CHECKING:
     from unshade.learned import Hybrid, Learned, SecondStageName, Settings
@@ -95,17 +95,6 @@ class Result:
     stages: dict[str, Any] | None = None
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Sums depend on how many threads share them; one thread gives the same bits everywhere, and small sums run faster."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 class Decomposition(Iterator[Step]):
     """The work on one picture. Iterate for improving trees, or ask for the `result` at once.
 
@@ -124,7 +113,7 @@ class Decomposition(Iterator[Step]):
     def __next__(self) -> Step:
         if self._cancelled or self._result is not None:
             raise StopIteration
-        with _one_thread():
+        with threads(1):
             found = next(self._work)
         if isinstance(found, Result):
             self._result = found
@@ -236,7 +225,7 @@ def fit(
     sphere = _sphere(image)
     held = {_locked_address(tree.root, where) for where in locked}
     target = srgb_decode(sphere.image) if tree.blend_space == "linear" else sphere.image
-    with _one_thread():
+    with threads(1):
         start = read_off(target, sphere.valid, tree.root, seed=seed, locked=held) if anew else tree.root
         fitted = fit_least_squares(target, sphere.valid, start, seed=seed, locked=held)
     trees = [dataclasses.replace(tree, root=root, exposure=sphere.exposure) for root in (fitted.root, tree.root)]
@@ -316,6 +305,7 @@ def _learned(
 
     proposed = learned.PROPOSED if method == "hybrid" else learned.Settings(second_stage=second_stage, objective=objective)
     given = settings or proposed
+    given = dataclasses.replace(given, threads=given.threads or torch.get_num_threads())
     try:
         networks = Networks.load(weights, given.device)
     except MissingWeightsError as error:

@@ -20,6 +20,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import torch
+
 from unshade.changes import removals, swaps
 from unshade.fit.least_squares import FINE_SOFTNESS, error_of, fit_pixels
 from unshade.fit.model import soften
@@ -31,6 +33,7 @@ from unshade.proposals import Fits
 from unshade.search import Search
 from unshade.search_drawn import DRAWN, SETTLED, settled
 from unshade.second_stage import SecondStage, SecondStageByDepth
+from unshade.threads import threads
 from unshade.types import Image, Mask
 
 PLACED_STEPS = 6
@@ -64,6 +67,8 @@ class Settings:
     """Of the search by depth."""
     device: str = "cpu"
     """Where the networks are; fits are on the CPU. Another device draws other samples from the same seed."""
+    threads: int = 0
+    """Of the networks, on a CPU; 0 for as many as PyTorch uses when the work begins."""
 
 
 PROPOSED = Settings(Inference(samples=12, trees=4))
@@ -129,7 +134,7 @@ class _Proposing:
         """Each level as it is drawn; `pools` holds the result."""
         work = infer(self.picture, self.networks, self.settings.inference, self.seed)
         while True:
-            with self.stages.clock("first stage"):
+            with self.stages.clock("first stage"), threads(self.settings.threads or torch.get_num_threads()):
                 found = next(work, None)
             if found is None:
                 return
