@@ -43,7 +43,6 @@ from unshade.relight import relight, turn, turn_of
 from unshade.render import render
 from unshade.replay import replay
 from unshade.sphere import disc_mask, sphere_normals
-from unshade.transfer import transfer
 
 ROOT = Path(__file__).resolve().parent.parent
 KEPT, RESULTS = ROOT / "out" / "editing", ROOT / "benchmarks" / "results" / "editing"
@@ -221,9 +220,9 @@ def measure_analogies(known: list[Known], cases: int) -> list[dict[str, Any]]:
                 continue  # nothing to understand, or nothing to do
             made += 1
             ab = (render(truth, NORMALS) * 255.0).round() / 255.0
-            scores = explain(Seen(a.image, disc_mask(SIZE), a.found), b.found, ab, disc_mask(SIZE))
-            got = next(iter(scores), None)
-            done = transfer(q.found, p.found, got) if got else p.found
+            seen = (Seen(one.image, disc_mask(SIZE), one.found) for one in (a, b))
+            explained = explain(*seen, ab, disc_mask(SIZE))
+            got, done = explained.component, explained.apply(q.found, p.found)
             rows.append(
                 {
                     "component": which.value,

@@ -9,17 +9,18 @@ import torch
 from hypothesis import given
 
 from strategies import trees
-from unshade.analogy import analogy
+from unshade.analogy import Seen, analogy, explain
 from unshade.components import Component, put_together, take_apart, uses
 from unshade.edit import move_light, remove, set_value
+from unshade.environments import raster
 from unshade.errors import PictureError, TreeError
 from unshade.grammar import sample
 from unshade.metrics import psnr
-from unshade.nodes import Leaf, Tree
+from unshade.nodes import Leaf, Operator, Tree, walk
 from unshade.render import render
 from unshade.replay import match, replay
 from unshade.serde import parse
-from unshade.sphere import sphere_normals
+from unshade.sphere import disc_mask, sphere_normals
 from unshade.transfer import component, components, mix, transfer
 
 NORMALS = sphere_normals(32, dtype=torch.float64)
@@ -151,6 +152,45 @@ def test_analogy_of_pictures() -> None:
     assert found.component is Component.ALBEDO and told == ["A", "B", "P", "Q"]
     wanted = render(parse("multiply(albedo(navy), diffuse(right))"), sphere_normals(256))
     assert psnr(render(found.tree, sphere_normals(256)), wanted) > 40.0
+
+
+def _reflecting(split_map: int, base: str, light: str) -> Tree:
+    """A varnished ball that reflects a photograph."""
+    coat = Leaf("environment_map", (raster("test", split_map), (0.0, 0.0, 0.0)))
+    return Tree(Operator("screen", (coat, parse(f"multiply({base})").root, parse(light).root)))
+
+
+def _moved(a: Tree, b: Tree, child: int) -> Tree:
+    """A with one operand of B."""
+    assert isinstance(a.root, Operator) and isinstance(b.root, Operator)
+    children = list(a.root.children)
+    children[child] = b.root.children[child]
+    return Tree(dataclasses.replace(a.root, children=tuple(children)))
+
+
+@pytest.mark.parametrize(("child", "which"), [(0, Component.ENVIRONMENT), (2, Component.HIGHLIGHTS)])
+def test_analogy_sees_a_reflection_that_trees_do_not_hold(child: int, which: Component) -> None:
+    a = _reflecting(14, "albedo(#c04030), diffuse(left up front, 0.3)", "highlight(right up front, 40)")
+    b = _reflecting(50, "albedo(#3060a0), diffuse(right front, 0.4)", "highlight(left front, 30)")
+    disc = disc_mask(256)
+    pictures = [(render(tree, sphere_normals(256)) * 255.0).round() / 255.0 for tree in (a, b, _moved(a, b, child))]
+    # What is found where nothing holds the reflections: base, highlight, and a broad light in the place of the environment.
+    stand_in = parse("highlight(up, 8, 0.4)").root
+    found = [Tree(Operator("screen", (*tree.root.children[1:], stand_in))) for tree in (a, b)]  # type: ignore[union-attr]
+    explained = explain(*(Seen(picture, disc, tree) for picture, tree in zip(pictures, found, strict=False)), pictures[2], disc)
+    assert explained.component is which and explained.seen in (which, None)
+    assert explained.seen is which or which is Component.HIGHLIGHTS
+    changed = explained.apply(found[1], found[0])
+    assert same(changed, transfer(found[1], found[0], which, stand_ins=which is Component.ENVIRONMENT))
+
+
+def test_lights_that_stand_for_an_environment_move_with_it() -> None:
+    a = parse("screen(multiply(albedo(red), diffuse(left)), highlight(right, 60, 1), highlight(up, 8, 0.4))")
+    b = parse("screen(multiply(albedo(blue), diffuse(up)), highlight(left, 60, 1), toon_highlight(down, 0.3))")
+    both = transfer(b, a, "environment", stand_ins=True)
+    assert [leaf.kind for _, leaf in walk(both.root) if "highlight" in leaf.kind] == ["highlight", "toon_highlight"]
+    assert both.find("screen.1.highlight")["direction"] == a.find("screen.1.highlight")["direction"]  # type: ignore[index]
+    assert same(transfer(b, a, "environment"), a), "without it nothing of a highlight is an environment"
 
 
 def test_analogy_refuses() -> None:

@@ -3,6 +3,8 @@
 AB is A with one component of B. Each component of B is put into A in turn, and what comes nearest to AB is what was done;
 then P gets that component of Q. Only A, B, P and Q are taken apart: AB is looked at, never decomposed, so that its own
 decomposition cannot mislead.
+
+Where no component explains AB well, the pictures are asked (`ratio`): a photograph that is reflected is more than a tree can hold.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from unshade.errors import PictureError, TreeError
 from unshade.metrics import psnr
 from unshade.nodes import Tree
 from unshade.pictures import SIZE, SphereImage, read_sphere, sphere_from_array
+from unshade.ratio import moved, thinned
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
 from unshade.transfer import transfer
@@ -34,6 +37,9 @@ VISIBLE = 50.0
 SURE = 3.0
 """dB by which an explanation must be nearer than the next to be sure of it."""
 
+CLEAR = 24.0
+"""dB from which on an explanation by trees needs no other."""
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -45,16 +51,39 @@ class Seen:
 
 
 @dataclass(frozen=True)
+class Explanation:
+    """What makes AB of A and B."""
+
+    scores: dict[Component, float]
+    """dB between AB and A with each component of B, best first; only components whose move changes A."""
+    seen: Component | None = None
+    """What the pictures tell, where no component explains AB well."""
+
+    @property
+    def component(self) -> Component | None:
+        """What was moved; None where no component of B changes A."""
+        return self.seen or next(iter(self.scores), None)
+
+    def apply(self, q: Tree, p: Tree) -> Tree:
+        """P with that component of Q. Raises TreeError for trees of different blend spaces."""
+        return p if self.component is None else transfer(q, p, self.component, stand_ins=self.seen is Component.ENVIRONMENT)
+
+
+@dataclass(frozen=True)
 class Analogy:
     """What was understood, and the answer."""
 
     tree: Tree
     """P with the component of Q."""
     component: Component
-    scores: dict[Component, float]
-    """dB between AB and A with each component of B, best first; only components whose move changes A."""
+    explanation: Explanation
     trees: dict[str, Tree]
     """The trees of A, B, P and Q."""
+
+    @property
+    def scores(self) -> dict[Component, float]:
+        """Of the explanation."""
+        return self.explanation.scores
 
     @property
     def margin(self) -> float:
@@ -64,14 +93,15 @@ class Analogy:
 
     @property
     def sure(self) -> bool:
-        """Is the margin large enough?"""
-        return self.margin >= SURE
+        """Is the margin large enough, and do the trees hold what was moved?"""
+        return self.margin >= SURE and self.explanation.seen is None
 
     def report(self) -> dict[str, Any]:
         """What was understood, for JSON."""
         return {
             "component": self.component.value,
             "sure": self.sure,
+            "seen_in_pictures": self.explanation.seen is not None,
             "margin_db": None if math.isinf(self.margin) else round(self.margin, 2),
             "scores_db": {which.value: round(min(score, 200.0), 2) for which, score in self.scores.items()},
             "understood": f"AB is A with the {self.component.value} of B; the answer is P with the {self.component.value} of Q",
@@ -106,28 +136,29 @@ def analogy(
         if told is not None and not isinstance(source, Tree):
             told(name)
         seen[name] = _seen(source, preset, seed)
-    scores = explain(seen["A"], seen["B"].tree, *_picture(goal))
-    if not scores:
+    found = explain(seen["A"], seen["B"], *_picture(goal))
+    if found.component is None:
         raise TreeError("no component of B changes A, so nothing can be understood from AB")
-    which = next(iter(scores))
-    answer = transfer(seen["Q"].tree, seen["P"].tree, which)
-    return Analogy(answer, which, scores, {name: one.tree for name, one in seen.items()})
+    answer = found.apply(seen["Q"].tree, seen["P"].tree)
+    return Analogy(answer, found.component, found, {name: one.tree for name, one in seen.items()})
 
 
-def explain(a: Seen, b: Tree, ab: Image, valid: Mask) -> dict[Component, float]:
-    """dB between AB and A with each component of B in turn, best first.
+def explain(a: Seen, b: Seen, ab: Image, valid: Mask) -> Explanation:
+    """Put each component of B into A in turn and look how near that comes to AB, at every other pixel.
 
     What the tree of A leaves of its picture unexplained is not held against any of them: changes are compared, not pictures.
     """
-    normals = sphere_normals(SIZE)
+    normals = thinned(sphere_normals(SIZE))
     before = render(a.tree, normals)
-    wanted = ab - a.image
+    wanted = thinned(ab - a.image)
     found = {}
     for which in Component:
-        change = render(transfer(b, a.tree, which), normals) - before
+        change = render(transfer(b.tree, a.tree, which), normals) - before
         if psnr(change, torch.zeros_like(change)) < VISIBLE:
-            found[which] = psnr(change, wanted, a.valid & valid)
-    return dict(sorted(found.items(), key=lambda entry: -entry[1]))
+            found[which] = psnr(change, wanted, thinned(a.valid & valid))
+    best = dict(sorted(found.items(), key=lambda entry: -entry[1]))
+    is_clear = any(score > CLEAR for score in best.values())
+    return Explanation(best, None if is_clear else moved(a.image, b.image, ab, a.valid & b.valid & valid))
 
 
 def _read(source: Source) -> Tree | SphereImage:

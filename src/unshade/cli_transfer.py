@@ -112,6 +112,9 @@ def analogy(a: str, b: str, ab: str, p: str, q: str, output: Path, preset: str, 
         dump(found.tree, folder / TREE_FILE)
     if as_json:
         click.echo(json.dumps(report))
+    if found.explanation.seen is not None:
+        messages.say(f"{report['understood']} (not surely: told from the pictures, the trees do not explain it)")
+        return
     best = next(iter(found.scores.values()))
     doubt = "" if found.sure else f", not surely: the next explanation is {found.margin:.1f} dB away"
     messages.say(f"{report['understood']} ({min(best, 200.0):.1f} dB{doubt})")

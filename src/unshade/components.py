@@ -9,6 +9,7 @@ tree that makes the same picture.
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -35,6 +36,12 @@ class Component(enum.Enum):
             raise TreeError(f"unknown component {word!r}{did_you_mean(word, words)}")
         return cls(word)
 
+
+NARROW = 25.0
+"""Least sharpness of a highlight that is surely none of an environment's lights."""
+
+STRONG = 0.6
+"""And what its amplitude is over."""
 
 WHITE = Leaf("albedo", ((1.0, 1.0, 1.0),))
 BLACK = Leaf("albedo", ((0.0, 0.0, 0.0),))
@@ -180,6 +187,26 @@ def light_component(node: Node) -> Component | None:
     if Role.RIM in roles:
         return Component.RIM
     return Component.DIFFUSE if all(leaf.role is Role.DIFFUSE for leaf in shades) else Component.HIGHLIGHTS
+
+
+def reflecting(lit: Lit) -> Lit:
+    """The parts with every highlight that is broad, weak, tinted or cut taken for a part of the environment.
+
+    Where a photograph is reflected, a tree of few values holds it as lights like these; a highlight is narrow, strong and white.
+    """
+    if isinstance(lit, Over):
+        return dataclasses.replace(lit, under=reflecting(lit.under))
+    if isinstance(lit, Sides):
+        return dataclasses.replace(lit, left=reflecting(lit.left), right=reflecting(lit.right))
+    lights = tuple(
+        Light(Component.ENVIRONMENT, light.part) if light.component is Component.HIGHLIGHTS and not _is_strong(light.part.node) else light
+        for light in lit.lights
+    )
+    return dataclasses.replace(lit, lights=lights)
+
+
+def _is_strong(node: Node) -> bool:
+    return isinstance(node, Leaf) and node.kind == "highlight" and node["sharpness"][0] >= NARROW and node["amplitude"][0] > STRONG
 
 
 def join(kind: str, nodes: list[Node], name: str | None = None) -> Node:

@@ -10,7 +10,22 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 
-from unshade.components import BLACK, WHITE, Base, Body, Component, Light, Lit, Over, Part, Sides, join, put_together, take_apart
+from unshade.components import (
+    BLACK,
+    WHITE,
+    Base,
+    Body,
+    Component,
+    Light,
+    Lit,
+    Over,
+    Part,
+    Sides,
+    join,
+    put_together,
+    reflecting,
+    take_apart,
+)
 from unshade.errors import TreeError
 from unshade.nodes import Leaf, Node, Operator, Tree
 from unshade.recolor import mean_color, recast
@@ -35,8 +50,10 @@ def components(tree: Tree) -> dict[Component, Node]:
     return {which: node for which, node in found.items() if node is not None}
 
 
-def transfer(source: Tree, target: Tree, which: Component | str) -> Tree:
+def transfer(source: Tree, target: Tree, which: Component | str, stand_ins: bool = False) -> Tree:
     """The target with a component of the source in the place of its own; where the source has none, without it.
+
+    ``stand_ins``: count lights that may stand for a reflected photograph to the environment (`components.reflecting`).
 
     Raises TreeError for trees of different blend spaces, whose numbers mean different things.
     """
@@ -44,6 +61,8 @@ def transfer(source: Tree, target: Tree, which: Component | str) -> Tree:
     if source.blend_space != target.blend_space:
         raise TreeError(f"cannot move {which.value} from a tree that blends in {source.blend_space} to one in {target.blend_space}")
     theirs, ours = take_apart(source.root), take_apart(target.root)
+    if stand_ins:
+        theirs, ours = reflecting(theirs), reflecting(ours)
     old, new = (_paint_color(lit) for lit in (ours, theirs))
     if which is Component.ALBEDO:
         paint = _paint(theirs)

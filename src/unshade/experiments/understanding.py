@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -18,7 +19,7 @@ from unshade.nodes import Tree
 from unshade.pictures import SIZE
 from unshade.render import render
 from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
-from unshade.transfer import transfer
+from unshade.types import Image
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,11 @@ def truths(question: Question, seed: int) -> tuple[Tree, ...]:
     return a, b, p, q, swapped(a, b, which), swapped(p, q, which)
 
 
+@lru_cache(maxsize=160)
+def _pool_picture(dataset: str, number: int, seed: int) -> Image:
+    return shown(pool(dataset, number + 1, seed)[number])
+
+
 def understood(question: Question, seed: int, perceptual: bool) -> dict[str, Any]:
     """The row of an analogy. A method whose trees cannot be edited so gives P back unchanged."""
     a, b, p, q, ab, answer = truths(question, seed)
@@ -48,13 +54,12 @@ def understood(question: Question, seed: int, perceptual: bool) -> dict[str, Any
     disc, scored = disc_mask(SIZE), disc_mask(SIZE, SCORED_RADIUS)
     row: dict[str, Any] = {"component": question.component, "understood": None, "pool": question.dataset, "numbers": list(question.numbers)}
     row["with_environment"] = any((pieces(tree) or {}).get(Component.ENVIRONMENT) for tree in (a, b, p, q))
-    done = found_p
+    done, pictures = found_p, [_pool_picture(question.dataset, number, seed) for number in question.numbers[:2]]
     try:
-        scores = explain(Seen(shown(a), disc, found_a), found_b, shown(ab), disc)
-        which = next(iter(scores), None)
-        if which is not None:
-            row["understood"] = which.value
-            done = transfer(found_q, found_p, which)
+        found = explain(Seen(pictures[0], disc, found_a), Seen(pictures[1], disc, found_b), shown(ab), disc)
+        if found.component is not None:
+            row |= {"understood": found.component.value, "seen_in_pictures": found.seen is not None}
+            done = found.apply(found_q, found_p)
     except TreeError as error:
         row["fault"] = str(error)
     picture, given = render(done, sphere_normals(SIZE)), shown(answer)
