@@ -170,6 +170,7 @@ def analogy(context: Context) -> tuple[Document, list[Row]]:
 
 def _judged(rows: Sequence[Row]) -> Row:
     found = {"right": rounded(sum(row["right"] for row in rows) / len(rows))}
+    found["right_by_trees"] = rounded(sum(row["by_trees"] == row["component"] for row in rows) / len(rows))
     for name in ("psnr", "ssim", "st_lpips"):
         numbers = [row[name] for row in rows if row.get(name) is not None]
         if numbers:

@@ -52,13 +52,19 @@ def understood(question: Question, seed: int, perceptual: bool) -> dict[str, Any
     a, b, p, q, ab, answer = truths(question, seed)
     found_a, found_b, found_p, found_q = (serde.loads(tree) for tree in question.found)
     disc, scored = disc_mask(SIZE), disc_mask(SIZE, SCORED_RADIUS)
-    row: dict[str, Any] = {"component": question.component, "understood": None, "pool": question.dataset, "numbers": list(question.numbers)}
+    row: dict[str, Any] = {
+        "component": question.component,
+        "understood": None,
+        "by_trees": None,
+        "pool": question.dataset,
+        "numbers": list(question.numbers),
+    }
     row["with_environment"] = any((pieces(tree) or {}).get(Component.ENVIRONMENT) for tree in (a, b, p, q))
     done, pictures = found_p, [_pool_picture(question.dataset, number, seed) for number in question.numbers[:2]]
     try:
         found = explain(Seen(pictures[0], disc, found_a), Seen(pictures[1], disc, found_b), shown(ab), disc)
         if found.component is not None:
-            row |= {"understood": found.component.value, "seen_in_pictures": found.seen is not None}
+            row |= {"understood": found.component.value, "by_trees": next((which.value for which in found.scores), None)}
             done = found.apply(found_q, found_p)
     except TreeError as error:
         row["fault"] = str(error)
