@@ -16,7 +16,7 @@ from unshade.environments import raster
 from unshade.errors import PictureError, TreeError
 from unshade.grammar import sample
 from unshade.metrics import psnr
-from unshade.nodes import Leaf, Operator, Tree, walk
+from unshade.nodes import Leaf, Operator, Raster, Tree, walk
 from unshade.render import render
 from unshade.replay import match, replay
 from unshade.serde import parse
@@ -182,6 +182,23 @@ def test_analogy_sees_a_reflection_that_trees_do_not_hold(child: int, which: Com
     assert explained.seen is which or which is Component.HIGHLIGHTS
     changed = explained.apply(found[1], found[0])
     assert same(changed, transfer(found[1], found[0], which, stand_ins=which is Component.ENVIRONMENT))
+
+
+def test_one_picture_does_not_tell_how_bright_an_environment_is() -> None:
+    """Why an analogy with reflections has a limit: two trees, other paint and form, other environment, one picture."""
+    stored = raster("test", 14)
+    paint, ambient, other = torch.tensor([0.7, 0.4, 0.3], dtype=torch.float64), 0.4, 0.25
+    scale = 1.0 - paint * ambient + other / (1.0 - other) * paint * (1.0 - ambient)
+    brighter = Raster.from_array(1.0 - scale[:, None, None] * (1.0 - stored.tensor(dtype=torch.float64)))
+
+    def ball(pixels: Raster, color: torch.Tensor, share: float) -> Tree:
+        shade = Operator("multiply", (Leaf("albedo", (tuple(color.tolist()),)), parse(f"diffuse(left up front, {share})").root))
+        return Tree(Operator("screen", (Leaf("environment_map", (pixels, (0.0, 0.0, 0.0))), shade)))
+
+    first, second = ball(stored, paint, ambient), ball(brighter, (scale - 1.0 + paint) / scale, other)
+    assert float((brighter.tensor() - stored.tensor()).mean()) > 0.03
+    # What is left is the 16 bits of a raster.
+    assert float((render(first, NORMALS) - render(second, NORMALS)).abs().max()) < 2e-5
 
 
 def test_lights_that_stand_for_an_environment_move_with_it() -> None:
