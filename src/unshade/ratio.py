@@ -127,7 +127,7 @@ class Ratio:
 
 
 def moved(a: Image, b: Image, ab: Image, valid: Mask) -> Component | None:
-    """The component of B that AB has and A has not, as far as pictures tell; None where they are alike, or too grainy to tell.
+    """The component of B that AB has and A has not, as far as pictures tell; None where they are alike, grey, or too grainy.
 
     White lights leave a grey ratio, highlights on a part of the ball. A reflected environment makes AB over A rough and AB over B
     smooth but for edges. Another form brightens and darkens all channels of the old paint together, and somewhere leaves them
@@ -138,7 +138,7 @@ def moved(a: Image, b: Image, ab: Image, valid: Mask) -> Component | None:
     """
     own, other = Ratio.of(ab, a, valid), Ratio.of(ab, b, valid)
     color = own.color
-    if own.changed < LEAST:
+    if own.changed < LEAST or Ratio.of(a, torch.zeros_like(a), valid).color < GREY:
         return None
     if color < GREY:
         return Component.RIM if own.changed > COMPACT else Component.HIGHLIGHTS

@@ -125,7 +125,7 @@ def analogy(options: Options, rows: Sequence[Row]) -> Path | None:
         dataset = next(row["pool"] for row in own)
         a, b, p, q, ab, answer = truths(Question(dataset, component, tuple(numbers)), options.seed)
         line = [(subjects.shown(tree), f"{component}\n{name}") for tree, name in zip((a, b, ab, p, q, answer), _GIVEN, strict=True)]
-        line += [(_drawn(row), f"{row['method']}: {row['understood']}\n{row['psnr']:.1f} dB") for row in own]
+        line += [(_drawn(row), f"{row['method']}\n{row['understood']}, {row['psnr']:.1f} dB") for row in own]
         lines.append(line)
     return draw(options.figures / "analogy.png", lines)
 
