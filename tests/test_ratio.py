@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from unshade.analogy import Seen, explain
 from unshade.components import Component
 from unshade.environments import raster
-from unshade.nodes import Leaf, Operator, Tree
+from unshade.nodes import Leaf, Operator, Raster, Tree
 from unshade.ratio import Ratio, moved
 from unshade.render import render
 from unshade.serde import parse
@@ -64,3 +65,34 @@ def test_pictures_that_tell_nothing(how: str) -> None:
     else:
         valid = torch.zeros_like(DISC)
     assert moved(a, b, ab, valid) is None
+
+
+@pytest.mark.parametrize("which", [Component.ENVIRONMENT, Component.HIGHLIGHTS])
+def test_analogy_sees_a_reflection_that_trees_do_not_hold(which: Component) -> None:
+    pictures = [shown(tree) for tree in (A, B, transfer(B, A, which))]
+    # What is found where nothing holds the reflections: all else, and a broad light in the place of the environment.
+    stand_in = parse("highlight(up, 8, 0.4)").root
+    found = [Tree(Operator("screen", (*tree.root.children[1:], stand_in))) for tree in (A, B)]  # type: ignore[union-attr]
+    a, b = (Seen(picture, DISC, tree) for picture, tree in zip(pictures, found, strict=False))
+    explained = explain(a, b, pictures[2], DISC)
+    is_environment = which is Component.ENVIRONMENT
+    assert explained.component is which and (explained.seen is which or not is_environment)
+    assert explained.apply(b.tree, a.tree) == transfer(b.tree, a.tree, which, stand_ins=is_environment)
+
+
+def test_one_picture_does_not_tell_how_bright_an_environment_is() -> None:
+    """Why an analogy with reflections has a limit: two trees, other paint and form, other environment, one picture."""
+    stored = raster("test", 14)
+    paint, ambient, other = torch.tensor([0.7, 0.4, 0.3], dtype=torch.float64), 0.4, 0.25
+    scale = 1.0 - paint * ambient + other / (1.0 - other) * paint * (1.0 - ambient)
+    brighter = Raster.from_array(1.0 - scale[:, None, None] * (1.0 - stored.tensor(dtype=torch.float64)))
+
+    def ball(pixels: Raster, color: torch.Tensor, share: float) -> Tree:
+        shade = Operator("multiply", (Leaf("albedo", (tuple(color.tolist()),)), parse(f"diffuse(left up front, {share})").root))
+        return Tree(Operator("screen", (Leaf("environment_map", (pixels, (0.0, 0.0, 0.0))), shade)))
+
+    normals = sphere_normals(32, dtype=torch.float64)
+    first, second = ball(stored, paint, ambient), ball(brighter, (scale - 1.0 + paint) / scale, other)
+    assert float((brighter.tensor() - stored.tensor()).mean()) > 0.03
+    # What is left is the 16 bits of a raster.
+    assert float((render(first, normals) - render(second, normals)).abs().max()) < 2e-5

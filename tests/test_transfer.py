@@ -9,18 +9,17 @@ import torch
 from hypothesis import given
 
 from strategies import trees
-from unshade.analogy import Seen, analogy, explain
+from unshade.analogy import analogy
 from unshade.components import Component, put_together, take_apart, uses
 from unshade.edit import move_light, remove, set_value
-from unshade.environments import raster
 from unshade.errors import PictureError, TreeError
 from unshade.grammar import sample
 from unshade.metrics import psnr
-from unshade.nodes import Leaf, Operator, Raster, Tree, walk
+from unshade.nodes import Leaf, Tree, walk
 from unshade.render import render
 from unshade.replay import match, replay
 from unshade.serde import parse
-from unshade.sphere import disc_mask, sphere_normals
+from unshade.sphere import sphere_normals
 from unshade.transfer import component, components, mix, transfer
 
 NORMALS = sphere_normals(32, dtype=torch.float64)
@@ -152,53 +151,6 @@ def test_analogy_of_pictures() -> None:
     assert found.component is Component.ALBEDO and told == ["A", "B", "P", "Q"]
     wanted = render(parse("multiply(albedo(navy), diffuse(right))"), sphere_normals(256))
     assert psnr(render(found.tree, sphere_normals(256)), wanted) > 40.0
-
-
-def _reflecting(split_map: int, base: str, light: str) -> Tree:
-    """A varnished ball that reflects a photograph."""
-    coat = Leaf("environment_map", (raster("test", split_map), (0.0, 0.0, 0.0)))
-    return Tree(Operator("screen", (coat, parse(f"multiply({base})").root, parse(light).root)))
-
-
-def _moved(a: Tree, b: Tree, child: int) -> Tree:
-    """A with one operand of B."""
-    assert isinstance(a.root, Operator) and isinstance(b.root, Operator)
-    children = list(a.root.children)
-    children[child] = b.root.children[child]
-    return Tree(dataclasses.replace(a.root, children=tuple(children)))
-
-
-@pytest.mark.parametrize(("child", "which"), [(0, Component.ENVIRONMENT), (2, Component.HIGHLIGHTS)])
-def test_analogy_sees_a_reflection_that_trees_do_not_hold(child: int, which: Component) -> None:
-    a = _reflecting(14, "albedo(#c04030), diffuse(left up front, 0.3)", "highlight(right up front, 40)")
-    b = _reflecting(50, "albedo(#3060a0), diffuse(right front, 0.4)", "highlight(left front, 30)")
-    disc = disc_mask(256)
-    pictures = [(render(tree, sphere_normals(256)) * 255.0).round() / 255.0 for tree in (a, b, _moved(a, b, child))]
-    # What is found where nothing holds the reflections: base, highlight, and a broad light in the place of the environment.
-    stand_in = parse("highlight(up, 8, 0.4)").root
-    found = [Tree(Operator("screen", (*tree.root.children[1:], stand_in))) for tree in (a, b)]  # type: ignore[union-attr]
-    explained = explain(*(Seen(picture, disc, tree) for picture, tree in zip(pictures, found, strict=False)), pictures[2], disc)
-    assert explained.component is which and explained.seen in (which, None)
-    assert explained.seen is which or which is Component.HIGHLIGHTS
-    changed = explained.apply(found[1], found[0])
-    assert same(changed, transfer(found[1], found[0], which, stand_ins=which is Component.ENVIRONMENT))
-
-
-def test_one_picture_does_not_tell_how_bright_an_environment_is() -> None:
-    """Why an analogy with reflections has a limit: two trees, other paint and form, other environment, one picture."""
-    stored = raster("test", 14)
-    paint, ambient, other = torch.tensor([0.7, 0.4, 0.3], dtype=torch.float64), 0.4, 0.25
-    scale = 1.0 - paint * ambient + other / (1.0 - other) * paint * (1.0 - ambient)
-    brighter = Raster.from_array(1.0 - scale[:, None, None] * (1.0 - stored.tensor(dtype=torch.float64)))
-
-    def ball(pixels: Raster, color: torch.Tensor, share: float) -> Tree:
-        shade = Operator("multiply", (Leaf("albedo", (tuple(color.tolist()),)), parse(f"diffuse(left up front, {share})").root))
-        return Tree(Operator("screen", (Leaf("environment_map", (pixels, (0.0, 0.0, 0.0))), shade)))
-
-    first, second = ball(stored, paint, ambient), ball(brighter, (scale - 1.0 + paint) / scale, other)
-    assert float((brighter.tensor() - stored.tensor()).mean()) > 0.03
-    # What is left is the 16 bits of a raster.
-    assert float((render(first, NORMALS) - render(second, NORMALS)).abs().max()) < 2e-5
 
 
 def test_lights_that_stand_for_an_environment_move_with_it() -> None:

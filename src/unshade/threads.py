@@ -9,7 +9,7 @@ import torch
 
 
 @contextmanager
-def threads(count: int = 1) -> Iterator[None]:
+def threads(count: int) -> Iterator[None]:
     """So many inside, as before outside."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
