@@ -17,7 +17,10 @@ from PIL import Image as PillowImage
 from unshade import environments
 from unshade.base_nodes import BASES, Base, Range
 from unshade.forest import CODES, Forest, Plant
+from unshade.made_environments import MADE_SHARE
 from unshade.nodes import KINDS
+from unshade.reflection_data import ENVIRONMENT_SHARE, UNALTERED_SHARE, reflection_batches
+from unshade.reflection_data import WIDE_SHARE as REAL_SHARE
 from unshade.sphere import disc_mask, sphere_normals
 from unshade.synthesis import GROVE, OPERATORS, TYPES, WIDE_SHARE, Batch, examples, plants
 
@@ -114,6 +117,12 @@ def roots(style: str) -> np.ndarray:
     made, owners = examples(grown(style, "test", -(-COLUMNS * ROWS // GROVE)), SIZE)
     last = torch.tensor([int((owners == tree).nonzero()[-1]) for tree in range(COLUMNS * ROWS)])
     return grid(made.parent[last], COLUMNS)
+
+
+def shown_reflections() -> np.ndarray:
+    """Pictures above what they are without their environment, and the environments."""
+    batch = next(reflection_batches("realistic", "train", size=SIZE, batch=COLUMNS, seed=0))
+    return grid(torch.cat([batch.pictures, batch.plain, batch.environments]), COLUMNS)
 
 
 def shown_examples() -> np.ndarray:
@@ -246,7 +255,24 @@ The first {COUNTED * GROVE} trees of each style, training half, seed 0:
 
 
 def page() -> str:
-    return HEAD + bases() + halves() + counts() + FILES
+    return HEAD + bases() + halves() + reflections() + counts() + FILES
+
+
+def reflections() -> str:
+    real, made = len(environments.names("train")), f"{MADE_SHARE:.0%}"
+    return f"""
+## Environments to tell reflections by
+
+The network `reflection` learns from pictures of whole trees and the environment of each, `reflection_data.reflection_batches`:
+{ENVIRONMENT_SHARE:.0%} of its trees have one, {REAL_SHARE:.0%} have the wider lights. From the {real} real environments of the
+training half alone it would learn those by heart. So {made} are made up
+([made_environments.py](../src/unshade/made_environments.py): noise with a random spectrum, a sky and a ground, windows and lamps, suns),
+and all are mirrored, recoloured, joined with real ones, and given other contrasts, blurs and exposures; {UNALTERED_SHARE:.0%} of the
+batches see the real ones as they are. So does the test half. Pictures of the training half, the same without
+their environment, and the environments:
+
+![reflections](dataset/reflections.png)
+"""
 
 
 def pictures() -> dict[str, np.ndarray]:
@@ -255,6 +281,7 @@ def pictures() -> dict[str, np.ndarray]:
         "toon.png": roots("toon"),
         "examples.png": shown_examples(),
         "environments.png": shown_environments(),
+        "reflections.png": shown_reflections(),
     }
 
 

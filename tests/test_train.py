@@ -63,14 +63,15 @@ def _few_evaluated() -> Iterator[None]:
 def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[train.Progress]]:
     """Every model trained for a few steps, one after the other, as `unshade train all` does."""
     folder = tmp_path_factory.mktemp("trained")
-    steps = {"vqvae": 100, "prior": 40, "heads": 60}
+    steps = {"vqvae": 100, "prior": 40, "heads": 60, "reflection": 60}
     return {task: finish(Run(task, config(steps[task], 8), folder, report_every=10, evaluate_every=1000)) for task in MODELS}
 
 
 @pytest.mark.parametrize("task", MODELS)
 def test_the_loss_falls(task: str, trained: dict[str, list[train.Progress]]) -> None:
     losses = [progress.loss for progress in trained[task]]
-    assert losses[-1] < 0.8 * losses[0]
+    # Other pictures at every step: what a few of them reflect, a tiny network learns in `test_reflection_training`.
+    assert losses[-1] < (0.9 if task == "reflection" else 0.8) * losses[0]
     figures = trained[task][-1].test
     assert {name.partition("_")[0] for name in figures} == {"realistic", "toon"}
     if task == "vqvae":
@@ -208,7 +209,8 @@ def test_the_command_trains_all(tmp_path: Path) -> None:
     assert [report["task"] for report in reports] == list(MODELS)
     page = (tmp_path / "weights" / "model-card.md").read_text(encoding="utf-8")
     assert all(title in page for title in model_card.TITLES.values())
-    assert "–" not in page.partition("# Model card")[2].replace("true – ", "")
+    # Drawings reflect nothing, so two figures of one model are of realistic trees alone.
+    assert page.count("–") == 2 == page.split("## Reflection")[1].count("–")
     assert weights.available(tmp_path / "weights")
 
 

@@ -12,7 +12,7 @@ import torch
 from torch.utils.data import Dataset
 
 from unshade.decoded import SIZE, leaf_of
-from unshade.forest import Forest
+from unshade.forest import Forest, pictures_of
 from unshade.models.tokens import LIGHTS, START, slots_of, tokens_of
 from unshade.nodes import Leaf, Node, Operator, Raster, Tree, leaf
 from unshade.render import render
@@ -82,9 +82,7 @@ class _Batches(Dataset):
         forest = Forest(grown)
         inside = disc_mask(self.size)[0]
         shaded = forest.shade(sphere_normals(self.size)[:, inside][:, None])
-        roots = torch.tensor([len(plant.numbers) for plant in grown]).cumsum(0) - 1
-        images = torch.zeros(len(grown), 3, self.size, self.size)
-        images[..., inside] = shaded[roots][:, :, 0]
+        images = pictures_of(shaded[torch.from_numpy(forest.roots())], self.size)
         return TreeBatch(images, *filled([tokens_of(with_lights(plant.tree())) for plant in grown]))
 
 

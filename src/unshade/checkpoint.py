@@ -113,5 +113,6 @@ def _check(path: Path, header: dict[str, str], identity: Identity) -> None:
 
 def _fixed(config: Config, task: str) -> tuple[Any, ...]:
     """What of a configuration cannot change on the way."""
-    own = config.baselines if task in BASELINES else (config.vqvae, config.prior, config.heads)
+    learned = (config.vqvae, config.prior, config.heads)
+    own = config.baselines if task in BASELINES else config.reflection if task == "reflection" else learned
     return config.size, own, config.training[task].batch

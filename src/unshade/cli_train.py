@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from unshade.terminal import Messages
     from unshade.train import Progress
 
-MODELS = ("vqvae", "prior", "heads")
+MODELS = ("vqvae", "prior", "heads", "reflection")
 """What `all` trains, in this order; the names are those of `unshade.train.TASKS`."""
 
 
@@ -70,11 +70,12 @@ def train(
     quiet: bool,
     **options: Any,
 ) -> None:
-    """Train the networks of the learned method, or a baseline.
+    """Train the networks, or a baseline.
 
     vqvae is the encoder and decoder of node images, prior draws children, heads are the operator, mask and type networks; prior needs a
-    trained vqvae. `all` trains each in turn, evaluates it on unseen nodes, and writes weights and a model card to DIR/weights. A call goes
-    on where the last one stopped: after Ctrl-C at that step, after a kill at the last save, a minute before at most.
+    trained vqvae. reflection takes a picture apart into what it reflects and the picture without it. `all` trains each in turn,
+    evaluates it on unseen nodes, and writes weights and a model card to DIR/weights. A call goes on where the last one stopped: after
+    Ctrl-C at that step, after a kill at the last save, a minute before at most.
 
     `baseline` trains what the experiments compare with: the cnn, the lstm or the transformer, or each in turn where none is named.
 
@@ -84,6 +85,7 @@ def train(
     Examples:
       unshade train all --config small -o run
       unshade train vqvae --config paper --batch 64 -o paper
+      unshade train reflection --precision bfloat16 --workers 1 -o run
       unshade train baseline lstm -o run
     """
     from unshade import train as loop

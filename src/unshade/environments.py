@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -50,9 +51,14 @@ def panoramas(split: str) -> Image:
     """The versions of a half, (V, 3, 64, 128) display-encoded in [0, 1] and rounded to 16 bits."""
     stored = load_file(STORED)
     light = torch.stack([stored[name].float() for name in names(split)])
-    shown = torch.stack([light if sharpness is None else blurred(light, sharpness) for sharpness in SHARPNESSES], dim=1)
-    exposed = shown[:, :, None] * torch.tensor(EXPOSURES).view(-1, 1, 1, 1)
-    return (srgb_encode(exposed.clamp(0.0, 1.0)) * 65535.0).round().flatten(0, 2) / 65535.0
+    return (versions_of(light, EXPOSURES, SHARPNESSES) * 65535.0).round() / 65535.0
+
+
+def versions_of(light: Image, exposures: Sequence[float], sharpnesses: Sequence[float | None]) -> Image:
+    """Environments (K, 3, h, w) of mean 1 at every blur and exposure, (V, 3, h, w) display-encoded, in the order of `versions`."""
+    shown = torch.stack([light if sharpness is None else blurred(light, sharpness) for sharpness in sharpnesses], dim=1)
+    exposed = shown[:, :, None] * torch.tensor(exposures).view(-1, 1, 1, 1)
+    return srgb_encode(exposed.clamp(0.0, 1.0)).flatten(0, 2)
 
 
 def raster(split: str, version: int) -> Raster:
@@ -64,8 +70,8 @@ def blurred(light: Image, sharpness: float) -> Image:
     """Environments (K, 3, h, w) seen in a rough coat: averaged with weights ``exp(-sharpness * |a - b|^2)`` of directions a and b."""
     height, width = light.shape[-2:]
     small = F.avg_pool2d(light, height // BLURRED_HEIGHT)
-    directions, areas = _directions(BLURRED_HEIGHT)
-    weights = torch.exp(-2.0 * sharpness * (1.0 - directions @ directions.T)) * areas
+    toward, areas = directions(BLURRED_HEIGHT)
+    weights = torch.exp(-2.0 * sharpness * (1.0 - toward @ toward.T)) * areas
     spread = (small.flatten(2) @ (weights / weights.sum(1, keepdim=True)).T).view_as(small)
     # Wrapped round before it is enlarged, so that no seam shows.
     wrapped = torch.cat([spread[..., -2:], spread, spread[..., :2]], dim=-1)
@@ -74,10 +80,10 @@ def blurred(light: Image, sharpness: float) -> Image:
     return large[..., 2 * scale : 2 * scale + width]
 
 
-def _directions(height: int) -> tuple[torch.Tensor, torch.Tensor]:
+def directions(height: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Directions of a lat-long picture's pixels, (N, 3), and the share of the sphere that each covers, (N,)."""
     latitude = (0.5 - (torch.arange(height) + 0.5) / height) * math.pi
     longitude = ((torch.arange(2 * height) + 0.5) / (2 * height) * 2.0 - 1.0) * math.pi
     up, around = torch.meshgrid(latitude, longitude, indexing="ij")
-    directions = torch.stack([up.cos() * around.sin(), up.sin(), up.cos() * around.cos()], dim=-1)
-    return directions.flatten(0, 1), up.cos().flatten() / up.cos().sum()
+    toward = torch.stack([up.cos() * around.sin(), up.sin(), up.cos() * around.cos()], dim=-1)
+    return toward.flatten(0, 1), up.cos().flatten() / up.cos().sum()

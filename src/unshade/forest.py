@@ -3,7 +3,7 @@ operators whose operands are known. Every operator has two operands here, as in 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -12,7 +12,7 @@ import torch
 
 from unshade.base_nodes import BASES, WIDTH, base_leaf, draw
 from unshade.blend import BLENDS
-from unshade.environments import panoramas
+from unshade.environments import panoramas as real_panoramas
 from unshade.nodes import KINDS, Leaf, Node, Operator, Role, Tree
 from unshade.sampler import VISIBLE, Structure
 from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
@@ -100,9 +100,12 @@ def seeds(outlines: Sequence[Outline], split: str, generator: torch.Generator) -
 
 
 class Forest:
-    """The nodes of many trees as one table on a device. Columns have N entries; ``tree`` says whose node it is."""
+    """The nodes of many trees as one table on a device. Columns have N entries; ``tree`` says whose node it is.
 
-    def __init__(self, plants: Sequence[Plant], device: torch.device | str = "cpu") -> None:
+    ``panoramas`` are the pictures that the versions of environments are of, for each half; None for the real ones.
+    """
+
+    def __init__(self, plants: Sequence[Plant], device: torch.device | str = "cpu", panoramas: Mapping[str, Image] | None = None) -> None:
         sizes = np.array([len(plant.numbers) for plant in plants])
         starts = np.cumsum(sizes) - sizes
         links = np.concatenate(
@@ -116,6 +119,11 @@ class Forest:
         self.numbers = torch.cat([plant.numbers for plant in plants]).to(device, torch.float32)
         self.split = np.array([plant.split for plant in plants])
         self.device = device
+        self.panoramas = panoramas
+
+    def roots(self) -> np.ndarray:
+        """Rows of the roots, a tree each."""
+        return np.flatnonzero(np.diff(self.tree, append=-1))
 
     def operators(self) -> np.ndarray:
         """Rows of the operators, in order."""
@@ -177,7 +185,7 @@ class Forest:
         return [*layers, values[self.mask[where]]] if name == "mix" else layers
 
     def _environments(self, where: torch.Tensor, split: str, normals: Normals) -> Image:
-        pictures = panoramas(split).to(self.device)
+        pictures = (self.panoramas[split] if self.panoramas else real_panoramas(split)).to(self.device)
         versions, turns = self.numbers[where, 0].long(), self.numbers[where, 1:4]
         # A few at a time: each copies its picture.
         chunks = zip(versions.split(32), turns.split(32), strict=True)
@@ -191,8 +199,18 @@ def checked_normals(stride: int) -> Normals:
     return sphere_normals(CHECKED_SIZE)[:, inside][:, None, ::stride].contiguous()
 
 
-def grow(outlines: Sequence[Outline], split: str, generator: torch.Generator, attempts: int = 5000) -> list[Plant]:
-    """One tree of each structure in which every leaf shows: drawn again and again until it does."""
+def pictures_of(values: Image, size: int) -> Image:
+    """Values at the pixels inside the disc, (N, C, 1, P), as pictures (N, C, size, size), 0 outside."""
+    pictures = values.new_zeros(*values.shape[:2], size, size)
+    pictures[..., disc_mask(size)[0].to(values.device)] = values[:, :, 0]
+    return pictures
+
+
+def grow(
+    outlines: Sequence[Outline], split: str, generator: torch.Generator, panoramas: Image | None = None, attempts: int = 5000
+) -> list[Plant]:
+    """One tree of each structure in which every leaf shows: drawn again and again until it does. ``panoramas`` as of a `Forest`."""
+    shown = None if panoramas is None else {split: panoramas}
     grown: dict[int, Plant] = {}
     for _ in range(attempts):
         missing = [index for index in range(len(outlines)) if index not in grown]
@@ -202,7 +220,7 @@ def grow(outlines: Sequence[Outline], split: str, generator: torch.Generator, at
         tried = [index for index in missing for _ in range(max(1, len(outlines) // len(missing)))]
         plants = seeds([outlines[index] for index in tried], split, generator)
         for stride, least in ((5, 0.8 * VISIBLE), (1, VISIBLE)):
-            good = Forest(plants).all_show(checked_normals(stride), least) if plants else np.array([], dtype=bool)
+            good = Forest(plants, panoramas=shown).all_show(checked_normals(stride), least) if plants else np.array([], dtype=bool)
             plants, tried = [p for p, ok in zip(plants, good, strict=True) if ok], [t for t, ok in zip(tried, good, strict=True) if ok]
         for index, plant in zip(tried, plants, strict=True):
             grown.setdefault(index, plant)

@@ -12,6 +12,7 @@ TITLES = {
     "vqvae": "VQ-VAE-2: node images to codes and back",
     "prior": "Priors: the codes of children",
     "heads": "Heads: operator (f), mask (g) and type (h)",
+    "reflection": "Reflection: a picture to its environment and the picture without",
 }
 
 BASELINES = {
@@ -43,6 +44,9 @@ MEANINGS = {
     "type_balanced_decoded": "the same, mean over the types",
     "mask_iou_decoded": "mask IoU, children decoded from codes",
     "mix_psnr_decoded": "PSNR of the parent mixed by the mask, children decoded from codes, dB",
+    "environment_psnr": "PSNR of environments, dB",
+    "plain_psnr": "PSNR of pictures without their environment, dB",
+    "untouched_psnr": "PSNR of pictures that have none, dB",
     "child_psnr": "PSNR of the children foretold, dB",
     "nats": "nats a token, against softened targets",
     "kinds_right": "kinds right, given all tokens before",
@@ -53,10 +57,10 @@ STYLES = ("realistic", "toon")
 
 HEAD = """# Model card
 
-The weights that ship with `unshade`, written by `unshade train all` and read by the learned method. This page is made from what
-stands in the files (`scripts/model_card.py`). Safetensors, parameters in half precision; how they were trained: [training](training.md).
-The baselines, which nothing but the [experiments](experiments.md) reads, are not in the package; they lie in `benchmarks/weights` of the
-repository.
+The weights that ship with `unshade`, written by `unshade train all`. The learned method reads all but `reflection`, which tells a search
+what a picture reflects. This page is made from what stands in the files (`scripts/model_card.py`). Safetensors, parameters in half
+precision; how they were trained: [training](training.md). The baselines, which nothing but the [experiments](experiments.md) reads, are
+not in the package; they lie in `benchmarks/weights` of the repository.
 
 Made for node images of shade trees: synthetic shaded spheres of the released grammar and wider ones, black outside the disc. Figures
 are of nodes from the test half of the data, whose colours, directions, masks and environment maps occur in no training tree. Photographs

@@ -23,7 +23,7 @@ from torch.utils.data import DataLoader, Dataset
 from unshade.base_nodes import SPLITS
 from unshade.blend import BLENDS
 from unshade.errors import TreeError, did_you_mean
-from unshade.forest import CODES, Forest, Outline, Plant, grow
+from unshade.forest import CODES, Forest, Outline, Plant, grow, pictures_of
 from unshade.nodes import Tree
 from unshade.sampler import Structure, structures
 from unshade.sphere import disc_mask, sphere_normals
@@ -92,7 +92,7 @@ def trees(style: Style, split: str, *, seed: int, start: int = 0) -> Iterator[Tr
     Raises:
         TreeError: an unknown style or split.
     """
-    _check(style, split)
+    check(style, split)
     for grove in count(start // GROVE):
         first = start % GROVE if grove == start // GROVE else 0
         for plant in plants(style, split, seed, grove)[first:]:
@@ -121,7 +121,7 @@ def batches(
     Raises:
         TreeError: an unknown style or split.
     """
-    _check(style, split)
+    check(style, split)
     mixed = max(1, min(MIXED_BATCHES, MIXED_NUMBERS // (batch * size * size)))
     blocks = _Blocks(style, split, size, batch, seed, mixed, torch.device("cpu" if workers else device))
     first = start // mixed
@@ -152,13 +152,8 @@ def render_examples(forest: Forest, rows: torch.Tensor, size: int) -> Batch:
     kinds = torch.from_numpy(forest.kinds).to(forest.device)
     codes = type_codes().to(forest.device)
 
-    def drawn(shaded: Image) -> Image:
-        image = shaded.new_zeros(len(rows), shaded.shape[1], size, size)
-        image[..., inside] = shaded[:, :, 0]
-        return image
-
     masks = values[mask.clamp(min=0), :1] * (mask >= 0)[:, None, None, None]
-    images = [drawn(shaded) for shaded in (values[rows], values[left], values[right], masks)]
+    images = [pictures_of(shaded, size) for shaded in (values[rows], values[left], values[right], masks)]
     # The operators are first in the table, in the order of `OPERATORS`.
     parent, first, second, masked = images
     return Batch(parent, first, second, kinds[rows], masked, codes[kinds[left]], codes[kinds[right]])
@@ -174,13 +169,18 @@ def type_codes() -> torch.Tensor:
 @lru_cache(maxsize=64)
 def plants(style: Style, split: str, seed: int, grove: int) -> tuple[Plant, ...]:
     """The trees of a grove."""
-    key = int.from_bytes(hashlib.blake2b(f"{style} {split} {seed} {grove}".encode(), digest_size=7).digest(), "big")
+    key = seed_of(f"{style} {split} {seed} {grove}")
     choices = random.Random(key)
-    outlines = [Outline.of(_structure(style, choices)) for _ in range(GROVE)]
+    outlines = [Outline.of(random_structure(style, choices)) for _ in range(GROVE)]
     return tuple(grow(outlines, split, torch.Generator().manual_seed(key)))
 
 
-def _structure(style: Style, choices: random.Random) -> Structure:
+def seed_of(words: str) -> int:
+    """A seed of 56 bits for what some words name."""
+    return int.from_bytes(hashlib.blake2b(words.encode(), digest_size=7).digest(), "big")
+
+
+def random_structure(style: Style, choices: random.Random) -> Structure:
     """A random structure in words of `base_nodes.BASES`."""
     own = choices.choice(("realistic", "toon")) if style == "both" else style
     environment = own == "realistic" and choices.random() < 0.5
@@ -188,15 +188,15 @@ def _structure(style: Style, choices: random.Random) -> Structure:
     if choices.random() >= WIDE_SHARE[own]:
         return structure
     if own == "realistic":
-        return _real(structure, choices)
+        return with_real_lights(structure, choices)
     drawn = _drawn(structure, choices)
     return ("mix", drawn, "ink", "outline") if choices.random() < 0.35 else drawn
 
 
-def _real(structure: Structure, choices: random.Random) -> Structure:
+def with_real_lights(structure: Structure, choices: random.Random) -> Structure:
     """With the lights of real pictures: broad ones and coloured ones."""
     if not isinstance(structure, str):
-        return (structure[0], *[_real(operand, choices) for operand in structure[1:]])
+        return (structure[0], *[with_real_lights(operand, choices) for operand in structure[1:]])
     if structure == "highlight":
         light = choices.choice(("broad_highlight", "wide_highlight"))
         return ("multiply", "albedo", light) if light == "broad_highlight" or choices.random() < 0.5 else light
@@ -267,7 +267,8 @@ def _as_it_is(block: Any) -> Any:
     return block
 
 
-def _check(style: str, split: str) -> None:
+def check(style: str, split: str) -> None:
+    """Raises TreeError for an unknown style or split."""
     if style not in STYLES:
         raise TreeError(f"unknown style {style!r}{did_you_mean(style, STYLES)}")
     if split not in SPLITS:

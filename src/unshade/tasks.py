@@ -20,7 +20,7 @@ from unshade.models.heads import Heads
 from unshade.models.prior import Priors
 from unshade.models.vqvae import VQVAE, Codes, codebook_use
 from unshade.sphere import SCORED_RADIUS, disc_mask
-from unshade.types import Image
+from unshade.types import Image, Mask
 
 if TYPE_CHECKING:
     from unshade.synthesis import Batch, Style
@@ -51,6 +51,8 @@ class Task(ABC, Generic[Data]):
     """
 
     name: str
+    data = "unshade.synthesis"
+    """Where its examples are from, for the card of its weights."""
 
     def __init__(self, config: Config, folder: Path, device: torch.device) -> None:
         self.config, self.folder, self.device = config, folder, device
@@ -83,10 +85,11 @@ class Task(ABC, Generic[Data]):
         return []
 
 
-def psnr(a: Image, b: Image) -> Tensor:
-    """`metrics.psnr` of each pair of (B, 3, S, S) images, (B,), at most 100 dB."""
+def psnr(a: Image, b: Image, where: Mask | None = None) -> Tensor:
+    """`metrics.psnr` of each pair of (B, 3, S, S) images, (B,), at most 100 dB; of some pixels (B, 1, S, S) bool alone where given."""
     disc = disc_mask(a.shape[-1], SCORED_RADIUS, a.device)
-    error = ((a.float() - b.float()) * disc).square().sum((1, 2, 3)) / (3.0 * disc.sum())
+    inside = disc[None] if where is None else disc & where
+    error = ((a.float() - b.float()) * inside).square().sum((1, 2, 3)) / (3.0 * inside.sum((1, 2, 3)).clamp(min=1))
     return -10.0 * torch.log10(error + 1e-10)
 
 

@@ -25,13 +25,16 @@ from unshade.errors import OutputError, UnshadeError, did_you_mean
 from unshade.models import weights
 from unshade.models.config import Config, TrainingConfig
 from unshade.picture_output import write_picture
+from unshade.reflection_task import ReflectionTask
 from unshade.tasks import HeadsTask, PriorTask, Task, VQVAETask
 from unshade.training_log import Log
 
 if TYPE_CHECKING:
     from unshade.synthesis import Style
 
-TASKS: dict[str, type[Task[Any]]] = {task.name: task for task in (VQVAETask, PriorTask, HeadsTask, CNNTask, LSTMTask, TransformerTask)}
+_TASKS: tuple[type[Task[Any]], ...] = (VQVAETask, PriorTask, HeadsTask, ReflectionTask, CNNTask, LSTMTask, TransformerTask)
+
+TASKS: dict[str, type[Task[Any]]] = {task.name: task for task in _TASKS}
 """Everything that can be trained, each after those whose weights it needs."""
 
 SAVE_EVERY_SECONDS = 60.0
@@ -201,7 +204,7 @@ def card(run: Run, position: Position, figures: dict[str, float]) -> dict[str, A
     return {
         "model": run.task,
         "config": run.config.name,
-        "data": f"unshade.synthesis, style {run.style}, split train, seed {run.seed}",
+        "data": f"{TASKS[run.task].data}, style {run.style}, split train, seed {run.seed}",
         "steps": position.step,
         "of": run.training.steps,
         "examples": position.step * run.training.batch * int(os.environ.get("WORLD_SIZE", "1")),

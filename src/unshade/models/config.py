@@ -60,6 +60,16 @@ class HeadsConfig:
 
 
 @dataclass(frozen=True)
+class ReflectionConfig:
+    """The network that tells what a picture reflects, from half of the picture's size down; every level is half of the one before."""
+
+    channels: tuple[int, ...] = (40, 80, 128, 160)
+    """Of every level, multiples of 8."""
+    blocks: tuple[int, ...] = (1, 1, 2, 2)
+    """Residual blocks of every level, on the way down and on the way up."""
+
+
+@dataclass(frozen=True)
 class BaselinesConfig:
     """The baselines, each about as large as the learned method's networks together."""
 
@@ -106,6 +116,7 @@ class Config:
     training: dict[str, TrainingConfig] = field(default_factory=dict)
     """For each task of `unshade.train`."""
     baselines: BaselinesConfig = BaselinesConfig()
+    reflection: ReflectionConfig = ReflectionConfig()
 
     @property
     def bottom(self) -> int:
@@ -133,8 +144,9 @@ class Config:
                 prior=PriorConfig(**data["prior"]),
                 heads=HeadsConfig(**data["heads"]),
                 training={name: TrainingConfig(**value) for name, value in data["training"].items()},
-                # Files from before there were baselines say nothing of them.
+                # Files from before there were these say nothing of them.
                 baselines=BaselinesConfig(**data.get("baselines", {})),
+                reflection=ReflectionConfig(**{name: tuple(value) for name, value in data.get("reflection", {}).items()}),
             )
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise ConfigError(f"expected the JSON of a model configuration, got {text[:60]!r} ({error})") from None
@@ -157,6 +169,7 @@ SMALL = Config(
         "vqvae": TrainingConfig(steps=12_000, batch=12, learning_rate=1e-3),
         "prior": TrainingConfig(steps=8_000, batch=16, learning_rate=1e-3, weight_decay=0.01),
         "heads": TrainingConfig(steps=3_000, batch=32, learning_rate=1e-3, weight_decay=0.01),
+        "reflection": TrainingConfig(steps=10_000, batch=32, learning_rate=1e-3, decay=0.8, weight_decay=0.01),
         "cnn": TrainingConfig(steps=8_000, batch=16, learning_rate=1e-3, weight_decay=0.01),
         "lstm": TrainingConfig(steps=8_000, batch=16, learning_rate=1e-3, weight_decay=0.01),
         "transformer": TrainingConfig(steps=8_000, batch=16, learning_rate=5e-4, weight_decay=0.01),
@@ -174,11 +187,13 @@ PAPER = Config(
         "vqvae": TrainingConfig(steps=200_000, batch=32, learning_rate=3e-4, warmup=1000),
         "prior": TrainingConfig(steps=200_000, batch=16, learning_rate=3e-4, warmup=1000, weight_decay=0.01),
         "heads": TrainingConfig(steps=50_000, batch=32, learning_rate=5e-4, warmup=500, weight_decay=0.01),
+        "reflection": TrainingConfig(steps=200_000, batch=32, learning_rate=5e-4, warmup=1000, decay=0.8, weight_decay=0.01),
         "cnn": TrainingConfig(steps=200_000, batch=32, learning_rate=5e-4, warmup=1000, weight_decay=0.01),
         "lstm": TrainingConfig(steps=200_000, batch=32, learning_rate=5e-4, warmup=1000, weight_decay=0.01),
         "transformer": TrainingConfig(steps=200_000, batch=32, learning_rate=3e-4, warmup=1000, weight_decay=0.01),
     },
     baselines=BaselinesConfig(184, 48, 1472, 3, 768, 13, 12),
+    reflection=ReflectionConfig((64, 96, 160, 224, 288, 320), (1, 1, 2, 2, 2, 2)),
 )
 """The paper's sizes: 256 x 256 images, 2,048 entries, 8 x 8 top and 32 x 32 bottom codes, PixelSNAIL of 256 channels. For a GPU."""
 
@@ -192,9 +207,11 @@ TINY = Config(
         "vqvae": TrainingConfig(steps=30, batch=4, learning_rate=3e-3, warmup=5),
         "prior": TrainingConfig(steps=30, batch=4, learning_rate=3e-3, warmup=5),
         "heads": TrainingConfig(steps=30, batch=4, learning_rate=3e-3, warmup=5),
+        "reflection": TrainingConfig(steps=30, batch=4, learning_rate=3e-3, warmup=5),
         **{name: TrainingConfig(steps=30, batch=4, learning_rate=3e-3, warmup=5) for name in BASELINES},
     },
     baselines=BaselinesConfig(cnn_channels=8, encoder_channels=8, lstm_width=48, lstm_layers=1, gpt_width=48, gpt_layers=2, gpt_heads=4),
+    reflection=ReflectionConfig((16, 24), (1, 1)),
 )
 """Seconds on any machine and of no use: for tests."""
 

@@ -26,6 +26,7 @@ from unshade.models.config import Config, ConfigError
 from unshade.models.heads import Heads
 from unshade.models.lstm_baseline import LSTMBaseline
 from unshade.models.prior import Priors
+from unshade.models.reflection import ReflectionNet
 from unshade.models.transformer_baseline import TransformerBaseline
 from unshade.models.vqvae import VQVAE
 
@@ -38,10 +39,13 @@ BASELINE_FOLDER = FOLDER.parents[2] / "benchmarks" / "weights"
 MODELS: dict[str, Callable[[Config], nn.Module]] = {"vqvae": VQVAE, "prior": Priors, "heads": Heads}
 """What the learned method needs; the name of a file is that of its training task."""
 
+SEARCH: dict[str, Callable[[Config], nn.Module]] = {"reflection": ReflectionNet}
+"""What the search asks about pictures that reflect."""
+
 BASELINES: dict[str, Callable[[Config], nn.Module]] = {"cnn": CNNBaseline, "lstm": LSTMBaseline, "transformer": TransformerBaseline}
 """What it is compared with."""
 
-_ALL = {**MODELS, **BASELINES}
+_ALL = {**MODELS, **SEARCH, **BASELINES}
 
 
 class WeightsError(UnshadeError):
@@ -86,7 +90,7 @@ def read_card(path: Path) -> dict[str, Any]:
 
 def _training(name: str) -> str:
     """The command that makes the weights of a model."""
-    return f"unshade train baseline {name}" if name in BASELINES else "unshade train all"
+    return f"unshade train {'baseline ' * (name in BASELINES)}{name}" if name in {*BASELINES, *SEARCH} else "unshade train all"
 
 
 def _header(path: Path) -> dict[str, str]:
@@ -110,7 +114,7 @@ def load(name: str, folder: str | os.PathLike[str] | None = None, device: torch.
     """A trained model in float32.
 
     Args:
-        name: vqvae, prior, heads, cnn, lstm or transformer.
+        name: vqvae, prior, heads, reflection, cnn, lstm or transformer.
         folder: of the weight files; None for those of the project.
     Raises:
         MissingWeightsError: there is no such file. WeightsError: it is damaged or of another model.
