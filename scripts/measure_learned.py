@@ -22,13 +22,14 @@ from typing import Any
 import torch
 
 from unshade import synthesis
-from unshade.decompose import PRESETS, decompose
+from unshade.decompose import decompose
 from unshade.inference import Networks
 from unshade.models import weights
 from unshade.models.prior import Priors
 from unshade.models.vqvae import VQVAE, Codes
 from unshade.nodes import KINDS, Node, Operator, Role, Tree, walk
 from unshade.pictures import SphereImage, find_pictures, read_sphere, sphere_from_array
+from unshade.presets import PRESETS
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
 

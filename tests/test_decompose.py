@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from unshade.decompose import PRESETS, Decomposition, Result, Step, decompose, fit
+from unshade.decompose import Decomposition, Result, Step, decompose, fit
 from unshade.errors import PictureError, TreeError
 from unshade.grammar import same_structure, sample, structure_key, validate
 from unshade.metrics import psnr
@@ -16,6 +16,7 @@ from unshade.nodes import KINDS, Leaf, Node, Tree, leaf, mix, multiply, screen
 from unshade.picture_output import write_picture
 from unshade.pictures import Disc, SphereImage, read_sphere
 from unshade.pixel_sets import CLEAN, grain
+from unshade.presets import PRESETS
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
 

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image as PILImage
 
 from unshade import cli
-from unshade.decompose import PRESETS
+from unshade.presets import PRESETS
 from unshade.serde import load, load_family
 
 

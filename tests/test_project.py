@@ -104,7 +104,7 @@ def test_the_trees_in_the_format_can_be_read() -> None:
 
 
 def test_every_preset_is_in_the_guide() -> None:
-    from unshade.decompose import PRESETS
+    from unshade.presets import PRESETS
 
     page = text_of("docs/how-to-choose.md")
     for name, preset in PRESETS.items():

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import torch
 
@@ -26,7 +26,7 @@ from unshade.pictures import SIZE, SphereImage, read_sphere, sphere_from_array
 from unshade.ratio import moved, thinned
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
-from unshade.transfer import transfer
+from unshade.transfer import component, transfer
 from unshade.types import Image, Mask
 
 Source: TypeAlias = "Tree | SphereImage | torch.Tensor | str | Path"
@@ -66,7 +66,10 @@ class Explanation:
 
     def apply(self, q: Tree, p: Tree) -> Tree:
         """P with that component of Q. Raises TreeError for trees of different blend spaces."""
-        return p if self.component is None else transfer(q, p, self.component, stand_ins=self.seen is Component.ENVIRONMENT)
+        if self.component is None:
+            return p
+        held = any(component(tree, Component.ENVIRONMENT) is not None for tree in (q, p))
+        return transfer(q, p, self.component, stand_ins=self.seen is Component.ENVIRONMENT and not held)
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,8 @@ def analogy(
     """Find what makes AB of A and B, and do it with P and Q.
 
     Args:
-        a, b, ab, p, q: trees or pictures. Pictures other than AB are decomposed first, with ``preset`` and ``seed``.
+        a, b, ab, p, q: trees or pictures. Pictures other than AB are decomposed first, with ``preset`` and ``seed``, and where the
+            network for it is there, with what they reflect as a picture, which can be moved whole.
         told: called with the name of each picture before it is decomposed.
     Raises:
         PictureError: a picture cannot be used. TreeError: no component of B changes A, or the blend spaces differ.
@@ -178,5 +182,11 @@ def _picture(source: Tree | SphereImage) -> tuple[Image, Mask]:
 
 
 def _seen(source: Tree | SphereImage, preset: str, seed: int) -> Seen:
-    tree = source if isinstance(source, Tree) else decompose(source, preset=preset, seed=seed).result().tree
+    if isinstance(source, Tree):
+        tree = source
+    else:
+        from unshade.models import weights
+
+        held: Literal["lights", "picture"] = "picture" if weights.file_of("reflection").is_file() else "lights"
+        tree = decompose(source, preset=preset, seed=seed, reflections=held).result().tree
     return Seen(*_picture(source), tree)

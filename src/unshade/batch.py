@@ -48,6 +48,7 @@ class Settings:
     method: Literal["search", "learned", "hybrid"] = "search"
     second_stage: Literal["size", "depth", "none"] = "size"
     weights: str | None = None
+    reflections: Literal["lights", "picture"] = "lights"
     disc: tuple[float, float, float] | None = None
     mask: str | None = None
     artifacts: str = "all"
@@ -59,7 +60,9 @@ class Settings:
         found["mask"] = digest(Path(self.mask)) if self.mask else None
         networks = {key: found.pop(key) for key in ("method", "second_stage", "weights")}
         if self.method != "search":
-            found |= networks | {"weights": _digest_of_weights(self.weights)}
+            found |= networks | {"weights": _digest_of_weights("learned", self.weights)}
+        if found.pop("reflections") == "picture":
+            found["reflections"] = _digest_of_weights("reflections", self.weights)
         return found | {"picture": digest(picture), "version": __version__}
 
 
@@ -80,10 +83,11 @@ def digest(path: Path) -> str:
         return ""
 
 
-def _digest_of_weights(folder: str | None) -> list[str]:
+def _digest_of_weights(use: Literal["learned", "reflections"], folder: str | None) -> list[str]:
     from unshade.models import weights
 
-    return [digest(weights.file_of(name, folder)) for name in weights.MODELS]
+    names = weights.MODELS if use == "learned" else weights.SEARCH
+    return [digest(weights.file_of(name, folder)) for name in names]
 
 
 def find_pictures(inputs: Iterable[Path]) -> list[Path]:
@@ -236,6 +240,7 @@ def _decompose_picture(job: Job, on_step: Callable[[Step], None] | None) -> Reco
         method=settings.method,
         second_stage=settings.second_stage,
         weights=settings.weights,
+        reflections=settings.reflections,
     )
     for step in decomposition:
         if on_step:

@@ -134,6 +134,13 @@ def cli(context: click.Context) -> None:
     show_default=True,
     help="Of --method learned, for nodes that the networks cannot decompose: our search, the paper's (minutes), or none.",
 )
+@click.option(
+    "--reflections",
+    type=click.Choice(["lights", "picture"]),
+    default="lights",
+    show_default=True,
+    help="Hold a reflected environment as lights, a few values each, or as a picture of 24,576 values, where a clean image shows one.",
+)
 @click.option("--weights", type=click.Path(path_type=str), metavar="DIR", help="Networks of `unshade train`, not those that ship.")
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes for several pictures; all cores when not given.")
 @click.option("--resume/--force", default=True, help="Skip pictures that are done with the same settings (the default), or do them again.")
@@ -165,6 +172,7 @@ def decompose(
       unshade decompose matcaps/ -o out --preset draft --artifacts tree --json > figures.jsonl
       unshade decompose photo.jpg -o out --disc 412,300,220 --mask hand.png
       unshade decompose ball.png -o out --method learned --json
+      unshade decompose chrome.png -o out --reflections picture
     """
     from unshade.terminal import Messages
 

@@ -20,6 +20,7 @@ from unshade.metrics import psnr
 from unshade.nodes import Family, Member, Node, Tree, find_address
 from unshade.pictures import SphereImage, read_sphere, sphere_from_array
 from unshade.pixel_sets import samples_of
+from unshade.presets import PRESETS, Preset
 from unshade.render import render, srgb_decode
 from unshade.search import Search
 from unshade.sphere import sphere_normals
@@ -31,40 +32,6 @@ if TYPE_CHECKING:
 
 METHODS = ("search", "learned", "hybrid")
 """Who proposes structures: the search, networks alone as in the paper, or networks and the search together."""
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A point on the curve between speed and quality. Work is counted in steps, so a result never depends on the machine."""
-
-    name: str
-    effort: Effort
-    fine: int
-    """Points on which the result is polished."""
-    members: int
-    """Most trees in the family."""
-    summary: str
-
-    @property
-    def max_values(self) -> int:
-        """Most values a tree may store."""
-        return self.effort.max_values
-
-
-PRESETS = {
-    preset.name: preset
-    for preset in (
-        Preset("draft", Effort(30, beam=0, trials=3, rounds=0, sweeps=0, polish_steps=10), 4000, 6, "at once, 30 values"),
-        Preset("balanced", Effort(64), 8000, 10, "a second or two, 64 values"),
-        Preset(
-            "best",
-            Effort(160, beam=2, beam_moves=5, trials=5, rounds=4, polish_steps=30, late=True),
-            12000,
-            16,
-            "several seconds, 160 values",
-        ),
-    )
-}
 
 
 @dataclass(frozen=True)
@@ -151,6 +118,7 @@ def decompose(
     second_stage: SecondStageName = "size",
     weights: str | Path | None = None,
     settings: Settings | None = None,
+    reflections: Literal["lights", "picture"] = "lights",
 ) -> Decomposition:
     """Decompose a picture of a shaded sphere into a shade tree.
 
@@ -169,9 +137,11 @@ def decompose(
             the paper's, minutes a picture, ``none`` makes them one colour.
         weights: folder of the networks; None for those that ship.
         settings: all about the networks' part, instead of ``second_stage`` and the defaults; see `unshade.learned`.
+        reflections: how a reflected environment is held: ``lights`` are a few values each; ``picture`` is a raster of 24,576
+            values over a tree of what is beneath (`unshade.reflections`), where a clean picture shows one; ``max_values`` is of the rest.
     Raises:
         PictureError: the picture cannot be used. TreeError: an argument is out of range. MissingExtraError: the
-            ``paper`` objective without its weights. MissingWeightsError: ``learned`` without its weights.
+            ``paper`` objective without its weights. MissingWeightsError: ``learned`` or ``picture`` without theirs.
     """
     if preset not in PRESETS:
         raise TreeError(f"unknown preset {preset!r}{did_you_mean(preset, PRESETS)}")
@@ -193,6 +163,11 @@ def decompose(
         raise TreeError("alternatives come from the search; take method='search' or 'hybrid'")
     if objective == "paper" and "depth" not in (search, second_stage if method == "learned" else ""):
         raise TreeError("the paper's objective belongs to search='depth'; the search by size compares pixels")
+    if reflections not in ("lights", "picture"):
+        raise TreeError(f"reflections must be lights or picture, got {reflections!r}")
+    if reflections == "picture" and search == "depth":
+        raise TreeError("reflections='picture' belongs to search='size'; the paper's search by depth knows lights only")
+    uncover = _uncovering(weights, seed) if reflections == "picture" else None
     if objective == "paper":
         from unshade.models import perceptual
 
@@ -204,7 +179,7 @@ def decompose(
     if search == "depth":
         return Decomposition(_by_depth(sphere, chosen, seed, objective), sphere, seed, preset)
     main = Search if method == "search" else _learned(sphere, method, seed, second_stage, objective, weights, settings)
-    return Decomposition(_without_gradients(_by_size(sphere, chosen, seed, alternatives, main)), sphere, seed, preset)
+    return Decomposition(_without_gradients(_by_size(sphere, chosen, seed, alternatives, main, uncover)), sphere, seed, preset)
 
 
 def fit(
@@ -289,6 +264,12 @@ def _without_gradients(work: Iterator[Step | Result]) -> Iterator[Step | Result]
 Begin: TypeAlias = "Callable[[Samples, Effort], Search | Learned | Hybrid]"
 """Starts the main search on a picture's pixels."""
 
+Uncover: TypeAlias = "Callable[[SphereImage, Node], Node | None]"
+"""From a tree of a picture to one with its environment as a raster, if it shows one."""
+
+HELD = 48.0
+"""dB from which on a tree holds a picture, whatever it reflects."""
+
 
 def _learned(
     sphere: SphereImage,
@@ -316,7 +297,16 @@ def _learned(
     return lambda samples, effort: main(sphere.image, sphere.valid, samples, effort, networks, given, seed)
 
 
-def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int, begin: Begin = Search) -> Iterator[Step | Result]:
+def _uncovering(weights: str | Path | None, seed: int) -> Uncover:
+    """Finds what is beneath a reflected environment. Raises MissingWeightsError, WeightsError."""
+    from unshade import reflections
+
+    return partial(reflections.uncover, network=reflections.load(weights), seed=seed)
+
+
+def _by_size(
+    sphere: SphereImage, preset: Preset, seed: int, alternatives: int, begin: Begin = Search, uncover: Uncover | None = None
+) -> Iterator[Step | Result]:
     samples = samples_of(sphere, preset.fine, seed)
     share = preset.effort.max_values
     total = share * alternatives
@@ -343,7 +333,15 @@ def _by_size(sphere: SphereImage, preset: Preset, seed: int, alternatives: int, 
         member = _member(sphere, candidate.root)
         if member.values < chosen.values and (curve[-1].psnr if curve else -math.inf) < member.psnr < chosen.psnr:
             curve.append(member)
-    family = Family((*curve, chosen), len(curve), tuple(others))
+    curve.append(chosen)
+    if uncover is not None and samples.is_clean and chosen.psnr < HELD:
+        yield Step(chosen.tree, chosen.psnr, chosen.values, "reflections", total - 1, total)
+        root = uncover(sphere, chosen.tree.root)
+        mirrored = _member(sphere, root) if root is not None else chosen
+        if mirrored.psnr > chosen.psnr:
+            chosen = mirrored
+            curve.append(chosen)
+    family = Family(tuple(curve), len(curve) - 1, tuple(others))
     yield Step(chosen.tree, chosen.psnr, chosen.values, "done", total, total)
     stages = getattr(main, "stages", None)
     yield Result(chosen.tree, family, chosen.psnr, seed, preset.name, stages.as_dict() if stages else None)

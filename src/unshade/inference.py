@@ -67,6 +67,9 @@ class Inference:
     """Levels of operators; a node that is not a leaf below them is left over."""
     nodes: int = 16
     """Most nodes of a pool that are decomposed, more than any tree of the released grammar has; the rest is left over."""
+    draws: int = 64
+    """Most nodes that are drawn for over all pools, those of the best pool first; what is open then is left over. No picture needed more
+    than 35; fewer are faster (docs/learned.md)."""
     similar: float = 0.02
     """alpha"""
     blank: float = 0.02
@@ -257,6 +260,12 @@ def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> I
     while any(pool.open for pool in pools):
         # Pools share their upper parts, which are drawn for once.
         parts = list({id(pool.parts[place]): pool.parts[place] for pool in pools for place in pool.open}.values())
+        parts = parts[: settings.draws - drawn]
+        if not parts:
+            yield Round(tuple(_left_over(pool, pool.open) for pool in pools), drawn)
+            return
+        chosen = {id(part) for part in parts}
+        pools = tuple(_left_over(pool, [place for place in pool.open if id(pool.parts[place]) not in chosen]) for pool in pools)
         with torch.no_grad():
             found = _splits(parts, networks, settings, generator)
         splits = {id(part): ways for part, ways in zip(parts, found, strict=True)}
@@ -269,8 +278,12 @@ def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> I
 
 def _limited(pool: Pool, most: int) -> Pool:
     """The pool with open parts left over that are too many."""
-    room = most - sum(part.state == "split" for part in pool.parts)
-    over = set(pool.open[room:])
+    return _left_over(pool, pool.open[most - sum(part.state == "split" for part in pool.parts) :])
+
+
+def _left_over(pool: Pool, places: Sequence[int]) -> Pool:
+    """The pool with some parts left over."""
+    over = set(places)
     if not over:
         return pool
     return Pool(tuple(dataclasses.replace(part, state="left over") if k in over else part for k, part in enumerate(pool.parts)))

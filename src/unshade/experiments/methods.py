@@ -3,7 +3,7 @@
 - ``cnn``, ``lstm``, ``transformer``: the baselines; with ``+fit`` our fit of the whole tree goes over what they found.
 - ``learned``: the paper's method; ``learned:base``, ``learned:samples``, ``learned:second``, ``learned:overall`` and
   ``learned:full`` are its ablation; ``learned:alone`` has no second stage, ``learned:depth`` the paper's own, minutes a picture.
-- ``search:PRESET``, ``hybrid:PRESET``: ours.
+- ``search:PRESET``, ``hybrid:PRESET``: ours; with ``+reflections`` a reflected environment is held as a picture.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from unshade import baselines
-from unshade.decompose import PRESETS, Decomposition, decompose, fit
+from unshade.decompose import Decomposition, decompose, fit
 from unshade.errors import MissingWeightsError, UnshadeError, did_you_mean
 from unshade.inference import Inference
 from unshade.learned import Settings
 from unshade.models import weights
 from unshade.nodes import Tree
 from unshade.pictures import SphereImage
+from unshade.presets import PRESETS
 
 NETWORKS = ("learned", "hybrid")
 
@@ -42,6 +43,8 @@ at nodes in their place, which is ours and the default. ``alone`` is all but the
 
 FIT = "+fit"
 
+REFLECTIONS = "+reflections"
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -59,12 +62,13 @@ class Name:
     kind: str
     argument: str
     fitted: bool
+    reflecting: bool
 
 
 def name_of(method: str) -> Name:
     """Raises UnshadeError with the nearest known word."""
-    kind, _, argument = method.removesuffix(FIT).partition(":")
-    fitted = method.endswith(FIT)
+    kind, _, argument = method.removesuffix(FIT).removesuffix(REFLECTIONS).partition(":")
+    fitted, reflecting = method.endswith(FIT), method.endswith(REFLECTIONS)
     known: dict[str, list[str]] = {
         **{name: [] for name in baselines.NAMES},
         "learned": [*VARIANTS],
@@ -77,7 +81,9 @@ def name_of(method: str) -> Name:
         raise UnshadeError(f"method {method!r}: {kind} takes {', '.join(known[kind]) or 'nothing'} after a colon")
     if fitted and kind not in baselines.NAMES:
         raise UnshadeError(f"method {method!r}: only the baselines are not fitted already")
-    return Name(kind, argument, fitted)
+    if reflecting and kind in baselines.NAMES:
+        raise UnshadeError(f"method {method!r}: the baselines hold no reflections")
+    return Name(kind, argument, fitted, reflecting)
 
 
 def missing(method: str, folder: Path | None) -> str | None:
@@ -92,7 +98,8 @@ def missing(method: str, folder: Path | None) -> str | None:
 
 
 def _models(name: Name) -> tuple[str, ...]:
-    return tuple(weights.MODELS) if name.kind in NETWORKS else (name.kind,) if name.kind in baselines.NAMES else ()
+    own = tuple(weights.MODELS) if name.kind in NETWORKS else (name.kind,) if name.kind in baselines.NAMES else ()
+    return (*own, *weights.SEARCH) if name.reflecting else own
 
 
 def digest(method: str, folder: Path | None) -> str:
@@ -112,7 +119,7 @@ def _digest(files: tuple[tuple[Path, int], ...]) -> str:
 def work(method: str, sphere: SphereImage, seed: int, folder: Path | None) -> Decomposition:
     """The improving trees of a method that has such. Raises UnshadeError."""
     name = name_of(method)
-    options: dict[str, Any] = {"preset": "balanced", "weights": folder}
+    options: dict[str, Any] = {"preset": "balanced", "weights": folder, "reflections": "picture" if name.reflecting else "lights"}
     if name.kind == "learned":
         options["settings"] = VARIANTS[name.argument or "full"]
     elif name.argument:

@@ -25,7 +25,8 @@ medians unless a column says otherwise.
 - **Methods.** `cnn`, `lstm` and `transformer` are the [baselines](training.md#baselines) as the paper describes them, nothing optimised
   afterwards; `+fit` is the same structure after our fit of the whole tree. `learned` is the paper's method as we implement it, its
   second stage our search on the nodes that the networks leave over, looked at [in their place](learned.md) as well, which is
-  ours; `learned:alone` does without. `search` and `hybrid` are ours.
+  ours; `learned:alone` does without. `search` and `hybrid` are ours; `+reflections` holds a reflected environment
+  [as a picture](reflections.md) of 24,576 values, in clean pictures that show one.
 - **Structure right (exact).** The canonical structure is that of the true tree, or (not exact) the answer is no larger and within 50 dB
   of the true tree. Trees with environment maps are counted apart.
 """
@@ -188,8 +189,9 @@ def _analogy(document: Document) -> Iterator[str]:
         "AB is A with one component of B; P is to get that component of Q. Four test trees of the released grammar and of one\n"
         "style each time; only their pictures are given. *Right* is the share in which the component was understood, and what the\n"
         "method's trees alone would have said; where they explain AB by less than 24 dB, the [ratio](../src/unshade/ratio.py) of the\n"
-        "pictures decides, for all methods alike ([its limits](editing.md#measured) were set on these trees). Faults are trees that could\n"
-        "not be edited so, where P stays as it is."
+        "pictures decides, for all methods alike ([its limits](editing.md#measured) were set on these trees). `+reflections` holds a\n"
+        "reflected environment [as a picture](reflections.md), as the command `analogy` does; it was built while these trees were looked\n"
+        "at. Faults are trees that could not be edited so, where P stays as it is."
     )
     yield ""
     columns: tuple[tuple[str, str, Cell], ...] = (

@@ -66,6 +66,12 @@ class Context:
             self.skipped[dataset] = "the folder is not there"
         return found
 
+    @property
+    def reflecting(self) -> list[str]:
+        """The default with reflected environments as pictures, where its weights are."""
+        found = [f"{method}{methods.REFLECTIONS}" for method in self.methods if method == "search:balanced"]
+        return [method for method in found if methods.missing(method, self.options.weights) is None]
+
     def job(self, kind: Any, case: Case, method: str, **more: Any) -> Job:
         """One job with this run's seed and weights."""
         folder = self.options.weights
@@ -77,7 +83,7 @@ Document = dict[str, Any]
 
 def decomposition(context: Context) -> tuple[Document, list[Row]]:
     """Experiment 1: every method on both styles and on real spheres."""
-    used = [*context.methods, *(f"{method}{methods.FIT}" for method in context.methods if method in BASELINES)]
+    used = [*context.methods, *(f"{method}{methods.FIT}" for method in context.methods if method in BASELINES), *context.reflecting]
     jobs = [
         context.job("tree", case, method, perceptual=context.perceptual)
         for dataset in SETS
@@ -141,10 +147,11 @@ def analogy(context: Context) -> tuple[Document, list[Row]]:
     asked = [question for component in Component for question in questions(component, count, size, seed)]
     used = {(question.dataset, number) for question in asked for number in question.numbers}
     cases = [case for dataset in POOLS for case in find_cases(dataset, default_data(), size) if (dataset, case.number) in used]
-    pictures = context.measure([context.job("tree", case, method) for method in context.methods for case in cases])
+    tried = [*context.methods, *context.reflecting]
+    pictures = context.measure([context.job("tree", case, method) for method in tried for case in cases])
     trees = {(row["method"], row["dataset"], int(row["name"])): row["tree"] for row in pictures}
     jobs = []
-    for method in context.methods:
+    for method in tried:
         places: dict[str, int] = {}
         for question in asked:
             place = places[question.component] = places.get(question.component, -1) + 1

@@ -1,0 +1,220 @@
+"""What is beneath a reflected environment: drawn edges, the tree that the bends of a picture tell, and the environment as a raster."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+import torch
+
+from unshade import metrics, reflections
+from unshade.analogy import analogy
+from unshade.circles import edge_circles, edge_masks
+from unshade.cli import run as run_command
+from unshade.components import Component
+from unshade.decompose import Result, decompose
+from unshade.environments import raster
+from unshade.errors import MissingWeightsError, TreeError, UnshadeError
+from unshade.experiments import methods
+from unshade.grammar import same_structure
+from unshade.models import weights
+from unshade.models.config import find
+from unshade.models.reflection import ReflectionNet
+from unshade.nodes import Leaf, Node, Operator, Raster, Tree, leaf, mix, multiply, replace, screen, walk
+from unshade.nodes import find as node_at
+from unshade.pictures import write_picture
+from unshade.render import render
+from unshade.separation import Separation
+from unshade.serde import parse
+from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
+from unshade.transfer import transfer
+from unshade.types import Image
+
+DISC, SCORED = disc_mask(256), disc_mask(256, SCORED_RADIUS)
+NORMALS = sphere_normals(256)
+
+COAT = Leaf("environment_map", (raster("test", 5), (0.0, 0.7, 0.0)))
+BENEATH = (
+    "screen(multiply(mix(albedo(#c04030), albedo(#308040), stripe(right up, 0.1, 0.4)), diffuse(left up front, 0.3)), "
+    "highlight(right up front, 40, 1.2), rim(left))"
+)
+
+
+def shown(root: Node | Tree) -> Image:
+    return (render(root, NORMALS) * 255.0).round() / 255.0
+
+
+def under(coat: Leaf, text: str = BENEATH) -> Node:
+    return Operator("screen", (*parse(text).root.children, coat))  # type: ignore[union-attr]
+
+
+def environment_of(root: Node) -> Leaf:
+    return next(node for _, node in walk(root) if isinstance(node, Leaf) and node.kind == "environment_map")
+
+
+@lru_cache(maxsize=1)
+def found() -> Result:
+    """With the weights that ship."""
+    return decompose(shown(under(COAT)), reflections="picture").result()
+
+
+@pytest.mark.parametrize(
+    "masks",
+    [
+        (),
+        ("threshold(left up front, 0.3)",),
+        ("stripe(right up, 0.1, 0.4)",),
+        ("stripe(right up, 0.1, 0.4)", "stripe(left up front, 0.1, 0.7)"),
+        ("threshold(down, -0.1)", "stripe(left front, 0.1, 0.6)"),
+    ],
+)
+def test_edges_of_masks_are_found_beneath_a_reflection(masks: tuple[str, ...]) -> None:
+    paint: Node = leaf("albedo", color=(0.7, 0.3, 0.2))
+    wanted = [parse(f"mix(albedo(#fff), albedo(#000), {mask})").root.mask for mask in masks]  # type: ignore[union-attr]
+    for mask, color in zip(wanted, ((0.2, 0.4, 0.6), (0.6, 0.6, 0.1)), strict=False):
+        assert mask is not None
+        paint = mix(paint, leaf("albedo", color=color), mask)
+    base = multiply(paint, leaf("diffuse", direction=(-0.5, 0.5, 0.7), ambient=0.4))
+    masks_found = edge_masks(shown(screen(base, COAT)), DISC)
+    # A mask and its complement have one edge, and hardly differ where it is found.
+    pictures = [(render(mask, NORMALS)[0] > 0.5)[SCORED[0]] for mask in masks_found]
+    assert len(masks_found) == len(wanted) and {mask.kind for mask in masks_found} == {mask.kind for mask in wanted if mask}
+    for mask in wanted:
+        assert mask is not None
+        true = (render(mask, NORMALS)[0] > 0.5)[SCORED[0]]
+        assert min(min(float((true != one).float().mean()), float((true == one).float().mean())) for one in pictures) < 0.004
+
+
+def test_no_edges_where_there_are_none() -> None:
+    noise = torch.rand(3, 256, 256, generator=torch.Generator().manual_seed(0))
+    assert edge_circles(noise, DISC) == []
+    assert edge_circles(shown(parse("multiply(albedo(#a06040), diffuse(up, 0.2))")), DISC) == []
+    assert edge_circles(torch.zeros(3, 256, 256), DISC) == []
+    assert edge_circles(shown(under(COAT)), DISC & False) == []
+
+
+@pytest.mark.parametrize("height", [32, 64])
+def test_a_panorama_is_read_off_a_mirror_ball(height: int) -> None:
+    mirror = shown(COAT)
+    read = reflections.panorama(mirror, DISC.expand(3, -1, -1).float(), height)
+    assert read.shape == (3, height, 2 * height)
+    again = leaf("environment_map", pixels=Raster.from_array(read))
+    assert metrics.psnr(shown(again), mirror, SCORED) > (38.0 if height == 32 else 48.0)
+
+
+def test_a_panorama_fills_in_what_is_not_seen() -> None:
+    weight = DISC.expand(3, -1, -1).float().clone()
+    weight[:, 100:140, 100:140] = 0.0
+    read = reflections.panorama(torch.where(weight > 0.0, 0.4, 1.0) * DISC, weight)
+    assert float((read - 0.4).abs().max()) < 0.02
+
+
+def test_bends_tell_two_paints_and_their_light() -> None:
+    """From numbers that are wrong, with a guess of the picture beneath that is too dark."""
+    true, picture = parse(BENEATH).root, shown(under(COAT))
+    start = replace(true, "screen.0.multiply.1.diffuse", node_at(true, "screen.0.multiply.1.diffuse").set(direction=(-0.3, 0.7, 0.6)))  # type: ignore[union-attr]
+    for place, color in (("0.albedo", (0.6, 0.35, 0.3)), ("1.albedo", (0.3, 0.4, 0.35))):
+        address = f"screen.0.multiply.0.mix.{place}"
+        start = replace(start, address, leaf("albedo", color=color))
+    guess = 0.8 * shown(true)
+    separation = Separation(picture, DISC, guess, 0)
+    fitted = separation.fit(start, 60, 1e-6)
+    before, guessed, after = (metrics.psnr(image, shown(true), SCORED) for image in (shown(start), guess, shown(fitted.root)))
+    assert after > max(before, guessed) + 2.0
+    assert fitted.cost < separation.fit(start, 0).cost
+    assert same_structure(Tree(fitted.root), Tree(true))
+
+
+def test_lights_that_do_not_pay_are_left_out() -> None:
+    true, picture = parse(BENEATH).root, shown(under(COAT))
+    separation = Separation(picture, DISC, shown(true), 0)
+    more = dataclasses.replace(true, children=(*true.children, leaf("highlight", direction=(-0.5, -0.5, 0.7), sharpness=60.0)))  # type: ignore[type-var,union-attr]
+    assert same_structure(Tree(separation.prune(separation.fit(more, 10)).root), Tree(true))
+    fewer = replace(true, "screen.1.highlight", None)
+    assert same_structure(Tree(separation.grow(separation.fit(fewer, 10)).root), Tree(true))
+
+
+def test_a_reflection_is_held_as_a_picture() -> None:
+    result, picture = found(), shown(under(COAT))
+    root = result.tree.root
+    assert metrics.psnr(shown(root), picture, SCORED) > 44.0
+    beneath = transfer(parse(BENEATH), result.tree, Component.ENVIRONMENT)
+    assert same_structure(beneath, parse(BENEATH))
+    assert metrics.psnr(shown(beneath), shown(parse(BENEATH)), SCORED) > 26.0
+    assert metrics.psnr(shown(environment_of(root)), shown(COAT), SCORED) > 22.0
+    # The tree of lights stays in the family, one size below.
+    lights, chosen = result.family.members[-2:]
+    assert chosen.tree == result.tree and chosen.psnr > lights.psnr
+    assert lights.values <= 64 < chosen.values
+
+
+def test_what_reflects_nothing_stays_as_it_is() -> None:
+    plain = shown(parse(BENEATH))
+    assert decompose(plain, reflections="picture").result().tree == decompose(plain).result().tree
+    network = reflections.load()
+    with torch.inference_mode():
+        assert reflections.beneath(plain, DISC, network)[1] < reflections.SHOWS
+        assert reflections.beneath(shown(under(COAT)), DISC, network)[1] > reflections.SHOWS
+
+
+def test_pictures_with_grain_stay_as_they_are() -> None:
+    grain = 0.01 * torch.randn(3, 256, 256, generator=torch.Generator().manual_seed(1))
+    picture = (shown(under(COAT)) + grain).clamp(0.0, 1.0)
+    result = decompose(picture, preset="draft", reflections="picture").result()
+    assert result.tree.values <= 30
+
+
+def test_an_environment_moves_in_an_analogy() -> None:
+    other = "screen(multiply(albedo(#3060a0), diffuse(right front, 0.4)), highlight(left front, 30, 1.2))"
+    p, q = parse(other), Tree(under(COAT))
+    a, b = parse("multiply(albedo(#808080), diffuse(up front, 0.3))"), Tree(screen(leaf("albedo", color=(0.5, 0.1, 0.1)), COAT))
+    ab = transfer(b, a, Component.ENVIRONMENT)
+    answer = analogy(a, b, shown(ab), p, found().tree)
+    assert answer.component is Component.ENVIRONMENT
+    wanted = transfer(q, p, Component.ENVIRONMENT)
+    assert metrics.psnr(shown(answer.tree), shown(wanted), SCORED) > 24.0
+
+
+def test_refusals(tmp_path: Path) -> None:
+    picture = shown(under(COAT))
+    with pytest.raises(MissingWeightsError, match="unshade train reflection"):
+        decompose(picture, reflections="picture", weights=tmp_path)
+    with pytest.raises(TreeError, match="lights or picture"):
+        decompose(picture, reflections="mirror")  # type: ignore[arg-type]
+    with pytest.raises(TreeError, match="search='size'"):
+        decompose(picture, reflections="picture", search="depth")
+    file = weights.file_of("reflection", tmp_path)
+    file.write_bytes(b"no weights")
+    with pytest.raises(weights.WeightsError, match="damaged"):
+        decompose(picture, reflections="picture", weights=tmp_path)
+    weights.save(file, "reflection", ReflectionNet(find("tiny")), find("tiny"), {})
+    assert reflections.load(tmp_path).places.shape[-1] == 16
+
+
+def test_without_weights_an_analogy_is_one_of_lights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(weights, "FOLDER", tmp_path)
+    base = parse("multiply(albedo(#808080), diffuse(up front, 0.3))")
+    lit = parse("screen(multiply(albedo(#204080), diffuse(left front, 0.3)), highlight(right front, 40, 1.2))")
+    answer = analogy(base, lit, shown(transfer(lit, base, "highlights")), shown(base), lit, preset="draft")
+    assert answer.component is Component.HIGHLIGHTS
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "ball.png"
+    write_picture(picture, shown(parse("multiply(albedo(#a06040), diffuse(left up, 0.2))")), DISC)
+    arguments = ["decompose", str(picture), "-o", str(tmp_path / "out"), "--artifacts", "tree", "--json", "--reflections"]
+    for how in ("lights", "picture", "picture"):
+        assert run_command([*arguments, how]) == 0
+        assert json.loads(capsys.readouterr().out)["values"] < 30
+    # Done again only where the settings differ.
+    assert len((tmp_path / "out" / "results.jsonl").read_text().splitlines()) == 2
+
+
+def test_experiments_name_it() -> None:
+    assert methods.name_of("search:balanced+reflections").reflecting
+    assert methods.digest("search:balanced+reflections", None) and not methods.digest("search:balanced", None)
+    with pytest.raises(UnshadeError, match="baselines hold no reflections"):
+        methods.name_of("cnn+reflections")
