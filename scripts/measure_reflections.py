@@ -171,8 +171,8 @@ with those paints and the guess's lights is then fitted to how the picture *bend
 of what the environment leaves, nothing of the tree N may be seen any more ([separation.py](../src/unshade/separation.py)). What
 is left over is the environment ([reflections.py](../src/unshade/reflections.py)).
 
-It is made for clean renderings and MatCaps in the words of the released grammar: one form, two masks at most, white highlights.
-Pictures with grain, those that a small tree holds at 48 dB, and those in which the network sees no reflection stay with lights.
+It is made for renderings and MatCaps in the words of the released grammar: one form, two masks at most, white highlights.
+Pictures with much grain, those that a small tree holds at 48 dB, and those in which the network sees no reflection stay with lights.
 One paint alone does not tell how much of its brightness is reflected, so there the guess decides.
 
 ## Measured

@@ -161,10 +161,18 @@ def test_what_reflects_nothing_stays_as_it_is() -> None:
 
 
 def test_pictures_with_grain_stay_as_they_are() -> None:
-    grain = 0.01 * torch.randn(3, 256, 256, generator=torch.Generator().manual_seed(1))
+    grain = 0.02 * torch.randn(3, 256, 256, generator=torch.Generator().manual_seed(1))
     picture = (shown(under(COAT)) + grain).clamp(0.0, 1.0)
     result = decompose(picture, preset="draft", reflections="picture").result()
     assert result.tree.values <= 30
+
+
+def test_pictures_that_tell_nothing() -> None:
+    """White, or nearly all of it ignored: no place to look at, and no failure."""
+    for picture in (torch.ones(3, 256, 256), 0.98 + 0.01 * shown(under(COAT))):
+        separation = Separation(picture, DISC, picture, 0)
+        assert separation.pixels.count == 0
+        assert decompose(picture, preset="draft", reflections="picture").result().tree.values <= 30
 
 
 def test_an_environment_moves_in_an_analogy() -> None:

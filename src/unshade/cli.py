@@ -139,7 +139,7 @@ def cli(context: click.Context) -> None:
     type=click.Choice(["lights", "picture"]),
     default="lights",
     show_default=True,
-    help="Hold a reflected environment as lights, a few values each, or as a picture of 24,576 values, where a clean image shows one.",
+    help="Hold a reflected environment as lights, a few values each, or as a picture of 24,576 values, where an image shows one.",
 )
 @click.option("--weights", type=click.Path(path_type=str), metavar="DIR", help="Networks of `unshade train`, not those that ship.")
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes for several pictures; all cores when not given.")

@@ -138,7 +138,7 @@ def decompose(
         weights: folder of the networks; None for those that ship.
         settings: all about the networks' part, instead of ``second_stage`` and the defaults; see `unshade.learned`.
         reflections: how a reflected environment is held: ``lights`` are a few values each; ``picture`` is a raster of 24,576
-            values over a tree of what is beneath (`unshade.reflections`), where a clean picture shows one; ``max_values`` is of the rest.
+            values over a tree of what is beneath (`unshade.reflections`), where a picture shows one; ``max_values`` is of the rest.
     Raises:
         PictureError: the picture cannot be used. TreeError: an argument is out of range. MissingExtraError: the
             ``paper`` objective without its weights. MissingWeightsError: ``learned`` or ``picture`` without theirs.
@@ -334,7 +334,7 @@ def _by_size(
         if member.values < chosen.values and (curve[-1].psnr if curve else -math.inf) < member.psnr < chosen.psnr:
             curve.append(member)
     curve.append(chosen)
-    if uncover is not None and samples.is_clean and chosen.psnr < HELD:
+    if uncover is not None and chosen.psnr < HELD:
         yield Step(chosen.tree, chosen.psnr, chosen.values, "reflections", total - 1, total)
         root = uncover(sphere, chosen.tree.root)
         mirrored = _member(sphere, root) if root is not None else chosen

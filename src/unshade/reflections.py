@@ -2,7 +2,7 @@
 
 A network (`models.reflection`) guesses the picture beneath. Its paints end where the picture has edges (`circles`), its lights are
 those of the guess and of a tree that was found before; all are fitted to how the picture bends (`separation`), and what is left of
-the picture then is the environment. Made for clean pictures of the released grammar: white highlights, one form, two masks at most.
+the picture then is the environment. Made for pictures of the released grammar: white highlights, one form, two masks at most.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from unshade.models.reflection import ReflectionNet
 from unshade.moves import add_light
 from unshade.nodes import KINDS, Leaf, Node, Operator, Raster, leaf, walk
 from unshade.pictures import SphereImage
+from unshade.pixel_sets import grain
 from unshade.render import render
 from unshade.separation import LIMITS, Separation
 from unshade.sphere import disc_mask, sphere_normals
@@ -36,6 +37,12 @@ from unshade.types import Image, Mask
 
 SHOWS = 0.03
 """Mean brightness of the environment, as the network takes it, from which on one is looked for."""
+
+GRAIN = 6.0
+"""Most grain of a picture (`pixel_sets.grain`): a sharp reflection has up to 5, a noisy photograph more."""
+
+PLACES = 200
+"""Least pixels that are known and not white."""
 
 HEIGHT = 64
 """Rows of the environment's picture."""
@@ -93,16 +100,19 @@ def beneath(image: Image, valid: Mask, network: ReflectionNet) -> tuple[Image, f
 
 
 def uncover(sphere: SphereImage, found: Node, network: ReflectionNet, seed: int) -> Node | None:
-    """A tree of a clean picture with its environment as a raster, on top of all; None where it reflects none.
+    """A tree of a picture with its environment as a raster, on top of all; None where it reflects none, or is too white or
+    has too much grain to tell.
 
     Args:
         found: a tree of the picture, whose lights are tried.
     """
     image, valid = sphere.image, sphere.valid
     plain, share = beneath(image, valid, network)
-    if share < SHOWS:
+    if share < SHOWS or grain(image, valid) > GRAIN:
         return None
     separation = Separation(image, valid, plain, seed)
+    if separation.pixels.count < PLACES:
+        return None
     pixels = Pixels.of(plain, valid, COARSE_SIZE)
     starts = (separation.fit(root, 8) for root in _starts(pixels, edge_masks(image, valid, seed)[:2]))
     current = separation.fit(min(starts, key=lambda separated: separated.cost).root, 25)

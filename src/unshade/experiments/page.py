@@ -26,7 +26,7 @@ medians unless a column says otherwise.
   afterwards; `+fit` is the same structure after our fit of the whole tree. `learned` is the paper's method as we implement it, its
   second stage our search on the nodes that the networks leave over, looked at [in their place](learned.md) as well, which is
   ours; `learned:alone` does without. `search` and `hybrid` are ours; `+reflections` holds a reflected environment
-  [as a picture](reflections.md) of 24,576 values, in clean pictures that show one.
+  [as a picture](reflections.md) of 24,576 values, in pictures that show one.
 - **Structure right (exact).** The canonical structure is that of the true tree, or (not exact) the answer is no larger and within 50 dB
   of the true tree. Trees with environment maps are counted apart.
 """
