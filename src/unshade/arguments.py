@@ -35,6 +35,16 @@ class Disc(click.ParamType):
         raise click.BadParameter(f"expected three numbers cx,cy,r in pixels such as 128,128,100, got {value!r}", ctx, param)
 
 
+reflections_option = click.option(
+    "--reflections",
+    type=click.Choice(["lights", "picture"]),
+    default="lights",
+    show_default=True,
+    help="Hold a reflected environment as lights, a few values each, or as a picture of 24,576 values, where an image shows one.",
+)
+"""Of `decompose`."""
+
+
 def output_options(function: Any) -> Any:
     """What `decompose` and `fit` share."""
     for option in (

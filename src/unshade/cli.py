@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from unshade import __version__, batch, cli_extract, cli_verbs
-from unshade.arguments import SEED, output_options, read_document, read_tree
+from unshade.arguments import SEED, output_options, read_document, read_tree, reflections_option
 from unshade.errors import TreeError, UnshadeError
 from unshade.staging import check_folder
 
@@ -134,13 +134,7 @@ def cli(context: click.Context) -> None:
     show_default=True,
     help="Of --method learned, for nodes that the networks cannot decompose: our search, the paper's (minutes), or none.",
 )
-@click.option(
-    "--reflections",
-    type=click.Choice(["lights", "picture"]),
-    default="lights",
-    show_default=True,
-    help="Hold a reflected environment as lights, a few values each, or as a picture of 24,576 values, where an image shows one.",
-)
+@reflections_option
 @click.option("--weights", type=click.Path(path_type=str), metavar="DIR", help="Networks of `unshade train`, not those that ship.")
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes for several pictures; all cores when not given.")
 @click.option("--resume/--force", default=True, help="Skip pictures that are done with the same settings (the default), or do them again.")
