@@ -243,7 +243,7 @@ def test_decompose_writes_everything(decomposed: list[dict[str, Any]], ball: Pat
     )
     assert told.code == 0, told.err
     asked = {"preset": "best", "max_values": 40, "seed": 5, "alternatives": 2, "search": "depth", "objective": "l2"}
-    assert decomposed == [asked | {"method": "search", "second_stage": "size", "weights": None}]
+    assert decomposed == [asked | {"method": "search", "second_stage": "size", "weights": None, "reflections": "lights"}]
     folder = tmp_path / "out" / "ball"
     assert {"tree.json", "render.png", "difference.png", "tree.svg", "report.html"} <= set(files(folder))
     assert len(list((folder / "layers").iterdir())) == 5
