@@ -137,6 +137,13 @@ def test_lights_that_do_not_pay_are_left_out() -> None:
     assert same_structure(Tree(separation.grow(separation.fit(fewer, 10)).root), Tree(true))
 
 
+def test_paint_and_form_are_never_left_out() -> None:
+    base = parse("multiply(albedo(#a06040), diffuse(up, 0.3))").root
+    white = torch.ones(3, 256, 256)
+    separation = Separation(shown(screen(base, COAT)), DISC, white, 0)
+    assert same_structure(Tree(separation.prune(separation.fit(base, 2)).root), Tree(base))
+
+
 def test_a_reflection_is_held_as_a_picture() -> None:
     result, picture = found(), shown(under(COAT))
     root = result.tree.root

@@ -233,7 +233,9 @@ _cost = attrgetter("cost")
 
 def _without_lights(root: Node) -> list[Node]:
     """Every tree with one light less."""
-    lights = [(k, child) for k, child in enumerate(root.children) if isinstance(child, Leaf)] if isinstance(root, Operator) else []
+    if not isinstance(root, Operator) or root.kind != "screen":
+        return []
+    lights = [(k, child) for k, child in enumerate(root.children) if isinstance(child, Leaf)]
     return [replace(root, f"{root.kind}.{k}.{child.kind}", None) for k, child in lights]
 
 
