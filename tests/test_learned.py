@@ -102,14 +102,27 @@ def test_a_node_whose_every_sample_is_bad_is_left_over(networks: Networks) -> No
     assert pool.left_over == [0]
 
 
-def test_a_pool_has_a_largest_size(networks: Networks) -> None:
+def endless(networks: Networks) -> Networks:
+    """Networks that take every child for an operator."""
+
     def forever(*images: torch.Tensor) -> torch.Tensor:
         return torch.nn.functional.one_hot(torch.zeros(len(images[-1]), dtype=torch.int64), 8).float()
 
     heads: Any = SimpleNamespace(operator=networks.heads.operator, mask=networks.heads.mask, types=forever)
-    endless = dataclasses.replace(networks, heads=heads)
-    (pool,) = pools(endless, dataclasses.replace(SETTINGS, depth=9, nodes=5))[-1].pools
+    return dataclasses.replace(networks, heads=heads)
+
+
+def test_a_pool_has_a_largest_size(networks: Networks) -> None:
+    (pool,) = pools(endless(networks), dataclasses.replace(SETTINGS, depth=9, nodes=5))[-1].pools
     assert [part.state for part in pool.parts].count("split") == 5 and len(pool.left_over) == 6
+
+
+@pytest.mark.parametrize(("trees", "draws"), [(1, 4), (3, 7), (2, 1)])
+def test_no_more_nodes_are_drawn_for_than_allowed(networks: Networks, trees: int, draws: int) -> None:
+    last = pools(endless(networks), dataclasses.replace(SETTINGS, depth=9, trees=trees, draws=draws))[-1]
+    assert last.drawn == draws and last.done
+    best = last.pools[0]
+    assert 1 <= [part.state for part in best.parts].count("split") <= draws and best.left_over
 
 
 def test_more_samples_never_choose_a_worse_one(networks: Networks) -> None:
