@@ -67,9 +67,9 @@ class Inference:
     """Levels of operators; a node that is not a leaf below them is left over."""
     nodes: int = 16
     """Most nodes of a pool that are decomposed, more than any tree of the released grammar has; the rest is left over."""
-    draws: int = 64
+    draws: int = 12
     """Most nodes that are drawn for over all pools, those of the best pool first; what is open then is left over. No picture needed more
-    than 35; fewer are faster (docs/learned.md)."""
+    than 35, which took twice as long for half a decibel (docs/learned.md)."""
     similar: float = 0.02
     """alpha"""
     blank: float = 0.02

@@ -71,7 +71,7 @@ class Settings:
     """Of the networks, on a CPU; 0 for as many as PyTorch uses when the work begins."""
 
 
-PROPOSED = Settings(Inference(samples=12, trees=4))
+PROPOSED = Settings(Inference(samples=12, draws=64, trees=4))
 """Of the hybrid: several trees side by side, which the search finishes."""
 
 
