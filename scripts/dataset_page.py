@@ -19,7 +19,7 @@ from unshade.base_nodes import BASES, Base, Range
 from unshade.forest import CODES, Forest, Plant
 from unshade.made_environments import MADE_SHARE
 from unshade.nodes import KINDS
-from unshade.reflection_data import ENVIRONMENT_SHARE, UNALTERED_SHARE, reflection_batches
+from unshade.reflection_data import ENVIRONMENT_SHARE, UNALTERED_SHARE, ReflectionBatches
 from unshade.reflection_data import WIDE_SHARE as REAL_SHARE
 from unshade.sphere import disc_mask, sphere_normals
 from unshade.synthesis import GROVE, OPERATORS, TYPES, WIDE_SHARE, Batch, examples, plants
@@ -121,7 +121,7 @@ def roots(style: str) -> np.ndarray:
 
 def shown_reflections() -> np.ndarray:
     """Pictures above what they are without their environment, and the environments."""
-    batch = next(reflection_batches("realistic", "train", size=SIZE, batch=COLUMNS, seed=0))
+    batch = ReflectionBatches("realistic", "train", SIZE, COLUMNS, 0)[0]
     return grid(torch.cat([batch.pictures, batch.plain, batch.environments]), COLUMNS)
 
 
@@ -263,7 +263,7 @@ def reflections() -> str:
     return f"""
 ## Environments to tell reflections by
 
-The network `reflection` learns from pictures of whole trees and the environment of each, `reflection_data.reflection_batches`:
+The network `reflection` learns from pictures of whole trees and the environment of each, `reflection_data.ReflectionBatches`:
 {ENVIRONMENT_SHARE:.0%} of its trees have one, {REAL_SHARE:.0%} have the wider lights. From the {real} real environments of the
 training half alone it would learn those by heart. So {made} are made up
 ([made_environments.py](../src/unshade/made_environments.py): noise with a random spectrum, a sky and a ground, windows and lamps, suns),

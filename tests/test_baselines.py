@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from unshade import baselines, train
-from unshade.baseline_data import tree_batches, with_lights
+from unshade.baseline_data import TreeBatches, with_lights
 from unshade.cli import run as command
 from unshade.errors import MissingWeightsError, TreeError, UnshadeError
 from unshade.grammar import same_structure, validate
@@ -105,9 +105,9 @@ def test_any_allowed_tokens_make_a_tree(generator: torch.Generator) -> None:
 
 
 def test_batches_depend_on_their_number_alone() -> None:
-    options: dict[str, Any] = {"size": 16, "batch": 5, "seed": 3}
-    whole = list(islice(tree_batches("toon", "train", **options), 8))
-    again = next(tree_batches("toon", "train", **options, start=7))
+    batches = TreeBatches("toon", "train", 16, 5, 3)
+    whole = list(islice(batches.stream(), 8))
+    again = next(batches.stream(start=7))
     assert all(torch.equal(getattr(whole[7], name), getattr(again, name)) for name in ("images", "tokens", "slots"))
     drawn = [tokens_of(tree) for tree in islice(trees("toon", "train", seed=3), 5)]
     assert [[token for token in row if token] for row in whole[0].tokens.tolist()] == drawn

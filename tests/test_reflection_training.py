@@ -19,7 +19,7 @@ from unshade.model_card import page
 from unshade.models import weights
 from unshade.models.config import CONFIGS, Config, ConfigError, ReflectionConfig, find
 from unshade.models.reflection import ReflectionNet
-from unshade.reflection_data import ReflectionBatch, reflection_batches, rendered
+from unshade.reflection_data import ReflectionBatch, ReflectionBatches, rendered
 from unshade.reflection_task import ReflectionTask
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
@@ -30,8 +30,7 @@ ROUNDING = 0.5 / 255.0 + 1e-6
 
 
 def batches(count: int, split: str = "train", *, style: Style = "realistic", size: int = 16, start: int = 0, workers: int = 0):  # type: ignore[no-untyped-def]
-    stream = reflection_batches(style, split, size=size, batch=8, seed=3, start=start, workers=workers)
-    return list(islice(stream, count))
+    return list(islice(ReflectionBatches(style, split, size, 8, 3).stream(start=start, workers=workers), count))
 
 
 @pytest.fixture(scope="module")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import count, islice
+from itertools import islice
 
 import torch
-from torch.utils.data import Dataset
 
 from unshade.decoded import SIZE, leaf_of
 from unshade.forest import Forest, pictures_of
@@ -18,7 +16,7 @@ from unshade.nodes import Leaf, Node, Operator, Raster, Tree, leaf
 from unshade.render import render
 from unshade.shading import rotate
 from unshade.sphere import disc_mask, sphere_normals
-from unshade.synthesis import GROVE, Style, ahead, plants
+from unshade.synthesis import GROVE, Batches, plants
 from unshade.types import Image
 
 
@@ -42,39 +40,11 @@ class TreeBatch:
         return len(self.tokens)
 
 
-def tree_batches(
-    style: Style,
-    split: str,
-    *,
-    size: int,
-    batch: int,
-    seed: int,
-    start: int = 0,
-    workers: int = 0,
-    device: torch.device | str = "cpu",
-) -> Iterator[TreeBatch]:
-    """Endless batches, the first of them batch ``start``: the trees of `synthesis.trees` in order, none twice.
-
-    Args:
-        size: width and height of the pictures. batch: trees in a batch.
-        workers: processes that prepare batches ahead; 0 prepares them here.
-    """
-    made = _Batches(style, split, size, batch, seed)
-    if not workers:
-        yield from (made[number].to(device) for number in count(start))
-        return
-    yield from (found.to(device) for found in ahead(made, start, workers))
-
-
-@dataclass(frozen=True)
-class _Batches(Dataset):
-    style: Style
-    split: str
-    size: int
-    batch: int
-    seed: int
+class TreeBatches(Batches[TreeBatch]):
+    """The trees of `synthesis.trees` in order, none twice."""
 
     def __getitem__(self, number: int) -> TreeBatch:
+        """See `Batches`."""
         first = number * self.batch
         groves = range(first // GROVE, (first + self.batch - 1) // GROVE + 1)
         grown = [plant for grove in groves for plant in plants(self.style, self.split, self.seed, grove)]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from unshade.baseline_data import TreeBatch, tree_batches
+from unshade.baseline_data import TreeBatch, TreeBatches
 from unshade.models.cnn_baseline import CNNBaseline, Split
 from unshade.models.lstm_baseline import LSTMBaseline
 from unshade.models.token_model import TokenModel
@@ -77,8 +77,7 @@ class TokenTask(Task[TreeBatch]):
 
     def stream(self, style: Style, split: str, *, batch: int, seed: int, start: int = 0, workers: int = 0) -> Iterator[TreeBatch]:
         """See `Task`."""
-        options: dict[str, Any] = {"size": self.config.size, "batch": batch, "seed": seed, "start": start, "workers": workers}
-        return tree_batches(style, split, **options, device=self.device)
+        return TreeBatches(style, split, self.config.size, batch, seed).stream(start=start, workers=workers, device=self.device)
 
     def outcome(self, model: nn.Module, batch: TreeBatch) -> Outcome:
         """Mean cross entropy of a token; kinds and numbers count alike."""

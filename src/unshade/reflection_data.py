@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import count
 
 import torch
-from torch.utils.data import Dataset
 
 from unshade import environments, made_environments
 from unshade.forest import CODES, Forest, Outline, grow, pictures_of
 from unshade.models.reflection import without
 from unshade.sampler import Structure, structures
 from unshade.sphere import disc_mask, sphere_normals
-from unshade.synthesis import Style, ahead, check, random_structure, seed_of, with_real_lights
+from unshade.synthesis import Batches, random_structure, seed_of, with_real_lights
 from unshade.types import Image
 
 ENVIRONMENT_SHARE = 0.85
@@ -57,49 +54,18 @@ class ReflectionBatch:
         return len(self.pictures)
 
 
-def reflection_batches(
-    style: Style,
-    split: str,
-    *,
-    size: int,
-    batch: int,
-    seed: int,
-    start: int = 0,
-    workers: int = 0,
-    device: torch.device | str = "cpu",
-) -> Iterator[ReflectionBatch]:
-    """Endless batches, the first of them batch ``start``; batch k depends on (style, split, batch, seed, k) alone.
+class ReflectionBatches(Batches[ReflectionBatch]):
+    """Pictures of whole trees. Toon trees have no environment; of ``both`` styles only the realistic one is drawn.
 
     Environments of the training half are made up or altered, see `made_environments`; those of the test half are the real ones.
-
-    Args:
-        style: realistic, which ``both`` is as well, since drawings reflect nothing; toon trees have no environment.
-        split: the half of the base nodes, train or test.
-        size: width and height of the pictures. batch: trees in a batch.
-        workers: processes that prepare batches ahead; 0 prepares them here.
-    Raises:
-        TreeError: an unknown style or split.
     """
-    check(style, split)
-    made = _Batches("toon" if style == "toon" else "realistic", split, size, batch, seed)
-    if not workers:
-        yield from (made[number].to(device) for number in count(start))
-        return
-    yield from (found.to(device) for found in ahead(made, start, workers))
-
-
-@dataclass(frozen=True)
-class _Batches(Dataset):
-    style: Style
-    split: str
-    size: int
-    batch: int
-    seed: int
 
     def __getitem__(self, number: int) -> ReflectionBatch:
-        key = seed_of(f"reflection {self.style} {self.split} {self.batch} {self.seed} {number}")
+        """See `Batches`."""
+        style = "toon" if self.style == "toon" else "realistic"
+        key = seed_of(f"reflection {style} {self.split} {self.batch} {self.seed} {number}")
         choices = random.Random(key)
-        outlines = [Outline.of(_structure(self.style, choices)) for _ in range(self.batch)]
+        outlines = [Outline.of(_structure(style, choices)) for _ in range(self.batch)]
         shown = _panoramas(self.split, self.seed, number // TOGETHER)
         grown = grow(outlines, self.split, torch.Generator().manual_seed(key), shown)
         return rendered(Forest(grown, panoramas={self.split: shown}), self.size)
@@ -115,7 +81,7 @@ def rendered(forest: Forest, size: int) -> ReflectionBatch:
     return ReflectionBatch((pictures_of(roots, size) * 255.0).round() / 255.0, pictures_of(reflected, size))
 
 
-def _structure(style: Style, choices: random.Random) -> Structure:
+def _structure(style: str, choices: random.Random) -> Structure:
     if style == "toon":
         return random_structure("toon", choices)
     structure = choices.choice(structures("realistic", choices.random() < ENVIRONMENT_SHARE, choices.random() < 0.5))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
 
 from unshade.models.reflection import ReflectionNet
-from unshade.reflection_data import ReflectionBatch, reflection_batches
+from unshade.reflection_data import ReflectionBatch, ReflectionBatches
 from unshade.sphere import disc_mask
 from unshade.tasks import SHOWN, Outcome, Task, psnr, sheet
 from unshade.types import Image, Mask
@@ -33,8 +33,7 @@ class ReflectionTask(Task[ReflectionBatch]):
 
     def stream(self, style: Style, split: str, *, batch: int, seed: int, start: int = 0, workers: int = 0) -> Iterator[ReflectionBatch]:
         """See `Task`."""
-        options: dict[str, Any] = {"size": self.config.size, "batch": batch, "seed": seed, "start": start, "workers": workers}
-        return reflection_batches(style, split, **options, device=self.device)
+        return ReflectionBatches(style, split, self.config.size, batch, seed).stream(start=start, workers=workers, device=self.device)
 
     def outcome(self, model: nn.Module, batch: ReflectionBatch) -> Outcome:
         """Absolute errors of both pictures, where there is anything to tell them by."""

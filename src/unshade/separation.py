@@ -131,8 +131,7 @@ class Separation:
     def fit(self, root: Node, steps: int, tolerance: float = 1e-4) -> Separated:
         """Fit the numbers of a tree by Levenberg-Marquardt on reweighted squares; hard edges stay where they are."""
         model = Model(root, self.pixels, limits=LIMITS)
-        vector = model.layout.pack(root)
-        vector[model.number] = torch.where(model.plain, vector[model.number].clamp(model.low, model.high), vector[model.number])
+        vector = model.start()
         values = model.evaluate(vector)
         cost, damping = self.of(model.compose(values)), 1e-2
         for _ in range(steps if model.free else 0):
@@ -170,9 +169,7 @@ class Separation:
         scale = model.scale(vector)
         hessian = torch.stack([sloped @ sloped.T for sloped, _ in rows]).sum(0) * scale[:, None] * scale
         gradient = torch.stack([sloped @ residual for sloped, residual in rows]).sum(0) * scale
-        numbers = vector[model.number]
-        held = ((numbers <= model.low) & (gradient > 0)) | ((numbers >= model.high) & (gradient < 0))
-        alive = (~held).double()
+        alive = (~model.held(vector, gradient)).double()
         return hessian * alive[:, None] * alive, gradient * alive
 
     def prune(self, current: Separated) -> Separated:

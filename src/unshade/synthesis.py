@@ -11,11 +11,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import random
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import count
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, Protocol, Self, TypeAlias, TypeVar
 
 import torch
 from torch.utils.data import DataLoader, Dataset
@@ -52,6 +53,13 @@ MIXED_NUMBERS = 1 << 24
 
 EXAMPLES_OF_A_TREE = 4
 """Operators of a tree, fewer than on the average, so that a grove or more has them for certain."""
+
+
+class _Movable(Protocol):
+    def to(self, device: torch.device | str) -> Self: ...
+
+
+Made = TypeVar("Made", bound=_Movable)
 
 
 @dataclass(frozen=True)
@@ -92,7 +100,7 @@ def trees(style: Style, split: str, *, seed: int, start: int = 0) -> Iterator[Tr
     Raises:
         TreeError: an unknown style or split.
     """
-    check(style, split)
+    _check(style, split)
     for grove in count(start // GROVE):
         first = start % GROVE if grove == start // GROVE else 0
         for plant in plants(style, split, seed, grove)[first:]:
@@ -121,19 +129,13 @@ def batches(
     Raises:
         TreeError: an unknown style or split.
     """
-    check(style, split)
     mixed = max(1, min(MIXED_BATCHES, MIXED_NUMBERS // (batch * size * size)))
-    blocks = _Blocks(style, split, size, batch, seed, mixed, torch.device("cpu" if workers else device))
-    first = start // mixed
-    loaded: Iterator[Batch]
-    if workers:
-        loader = ahead(blocks, first, workers)
-        loaded = iter(loader)
-    else:
-        loaded = (blocks[number] for number in count(first))
-    for number, block in enumerate(loaded, start=first):
-        for k in range(start - first * mixed if number == first else 0, mixed):
-            yield block[slice(k * batch, (k + 1) * batch)].to(device)
+    blocks = _Blocks(style, split, size, mixed * batch, seed, torch.device("cpu" if workers else device))
+    first, skipped = divmod(start, mixed)
+    for block in blocks.stream(start=first, workers=workers, device=device):
+        for k in range(skipped, mixed):
+            yield block[slice(k * batch, (k + 1) * batch)]
+        skipped = 0
 
 
 def examples(grown: Sequence[Plant], size: int, device: torch.device | str = "cpu") -> tuple[Batch, torch.Tensor]:
@@ -217,29 +219,54 @@ def _drawn(structure: Structure, choices: random.Random) -> Structure:
 
 
 @dataclass(frozen=True)
-class _Blocks(Dataset):
-    """Block n holds the batches n * mixed, n * mixed + 1, ... as one."""
+class Batches(Dataset[Made], ABC):
+    """Endless batches of what is drawn from the grammar. Batch k depends on these fields and on k alone, neither on where a stream
+    began nor on the workers.
+
+    Raises:
+        TreeError: an unknown style or split.
+    """
 
     style: Style
     split: str
+    """The half of the base nodes, train or test."""
     size: int
+    """Width and height of the pictures."""
     batch: int
+    """Items in a batch."""
     seed: int
-    mixed: int
-    device: torch.device
 
-    def __getitem__(self, block: int) -> Batch:
-        wanted = self.mixed * self.batch
-        groves = -(-wanted // (GROVE * EXAMPLES_OF_A_TREE))
-        grown = [plant for grove in range(groves) for plant in plants(self.style, self.split, self.seed, block * groves + grove)]
-        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + block) % (1 << 62))
+    def __post_init__(self) -> None:
+        _check(self.style, self.split)
+
+    @abstractmethod
+    def __getitem__(self, number: int) -> Made:
+        """Batch ``number``."""
+
+    def stream(self, *, start: int = 0, workers: int = 0, device: torch.device | str = "cpu") -> Iterator[Made]:
+        """The batches from ``start`` on, on a device. ``workers`` processes prepare them ahead; 0 prepares them here."""
+        made = _ahead(self, start, workers) if workers else map(self.__getitem__, count(start))
+        return (batch.to(device) for batch in made)
+
+
+@dataclass(frozen=True)
+class _Blocks(Batches[Batch]):
+    """Examples that are shuffled together."""
+
+    device: torch.device
+    """Where they are made."""
+
+    def __getitem__(self, number: int) -> Batch:
+        groves = -(-self.batch // (GROVE * EXAMPLES_OF_A_TREE))
+        grown = [plant for grove in range(groves) for plant in plants(self.style, self.split, self.seed, number * groves + grove)]
+        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + number) % (1 << 62))
         forest = Forest(grown, self.device)
         rows = torch.from_numpy(forest.operators())
-        assert len(rows) >= wanted, f"{len(rows)} examples where {wanted} are needed"
-        return render_examples(forest, rows[torch.randperm(len(rows), generator=generator)[:wanted]], self.size)
+        assert len(rows) >= self.batch, f"{len(rows)} examples where {self.batch} are needed"
+        return render_examples(forest, rows[torch.randperm(len(rows), generator=generator)[: self.batch]], self.size)
 
 
-def ahead(batches: Dataset[Any], first: int, workers: int) -> DataLoader[Any]:
+def _ahead(batches: Dataset[Any], first: int, workers: int) -> DataLoader[Any]:
     """Batches ``first``, ``first`` + 1, ... of an endless set, prepared in other processes."""
     # Spawned: a fork of a process with threads or a GPU may hang.
     return DataLoader(
@@ -267,7 +294,7 @@ def _as_it_is(block: Any) -> Any:
     return block
 
 
-def check(style: str, split: str) -> None:
+def _check(style: str, split: str) -> None:
     """Raises TreeError for an unknown style or split."""
     if style not in STYLES:
         raise TreeError(f"unknown style {style!r}{did_you_mean(style, STYLES)}")

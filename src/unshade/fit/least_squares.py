@@ -55,10 +55,8 @@ def minimise(
             scale = model.scale(vector)
             hessian = (flat @ flat.T).double() * scale[:, None] * scale
             gradient = (flat @ error_image.reshape(-1)).double() * scale
-            numbers = vector[model.number]
-            held = ((numbers <= model.low) & (gradient > 0)) | ((numbers >= model.high) & (gradient < 0))
             diagonal = hessian.diagonal().clamp(min=1e-9)
-            dead = held | (hessian.diagonal() < 1e-14)
+            dead = model.held(vector, gradient) | (hessian.diagonal() < 1e-14)
             alive = (~dead).double()
             hessian *= alive[:, None] * alive
             gradient *= alive
@@ -102,9 +100,7 @@ def fit_pixels(
     """Fit the parameters of a structure at given pixels, from the tree's own numbers."""
     with torch.no_grad():
         model = Model(root, pixels, locked, softest, limits)
-        start = model.layout.pack(root)
-        start[model.number] = torch.where(model.plain, start[model.number].clamp(model.low, model.high), start[model.number])
-        vector, error, history = minimise(model, start, steps, tolerance)
+        vector, error, history = minimise(model, model.start(), steps, tolerance)
         return Fitted(model.layout.unpack(root, vector), error, tuple(history))
 
 

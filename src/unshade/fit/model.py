@@ -333,6 +333,17 @@ class Model:
         """d number / d coordinate where it is not 1: the number itself for logarithmic ones, (F,)."""
         return torch.where(self.log, vector[self.number], torch.ones_like(vector[self.number]))
 
+    def start(self) -> torch.Tensor:
+        """The tree's own numbers as a vector (P,), inside their bounds."""
+        vector = self.layout.pack(self.root)
+        vector[self.number] = torch.where(self.plain, vector[self.number].clamp(self.low, self.high), vector[self.number])
+        return vector
+
+    def held(self, vector: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+        """The coordinates at a bound that a gradient (F,) pushes outwards, (F,) bool."""
+        numbers = vector[self.number]
+        return ((numbers <= self.low) & (gradient > 0)) | ((numbers >= self.high) & (gradient < 0))
+
 
 def _rows(chosen: torch.Tensor) -> torch.Tensor:
     """The numbers of the true entries of (F,) bool."""
