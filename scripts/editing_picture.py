@@ -7,15 +7,15 @@ from pathlib import Path
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
+from unshade.assignment import read_color
 from unshade.decompose import decompose
-from unshade.edit import harden, move_light, read_color, remove, soften
+from unshade.edit import harden, move_light, remove, soften, transfer
 from unshade.nodes import Tree, leaf
 from unshade.pictures import read_sphere
 from unshade.recolor import recolor
 from unshade.relight import relight
 from unshade.selection import select
 from unshade.surroundings import Surroundings, under
-from unshade.transfer import transfer
 from unshade.turntable import directions, frame
 from unshade.vary import vary
 

@@ -27,9 +27,9 @@ import numpy as np
 import torch
 
 from unshade.apply import apply_to_photo
+from unshade.assignment import read_color
 from unshade.bench.report import machine, versions
 from unshade.decompose import decompose
-from unshade.edit import read_color
 from unshade.extract import Extraction, from_normal_map
 from unshade.inflate import inflate
 from unshade.metrics import psnr

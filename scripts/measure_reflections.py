@@ -24,6 +24,7 @@ from PIL import Image, ImageDraw, ImageFont
 from unshade.bench.report import machine, versions
 from unshade.components import Component
 from unshade.decompose import decompose
+from unshade.edit import transfer
 from unshade.experiments.pieces import pieces
 from unshade.experiments.subjects import known
 from unshade.grammar import same_structure
@@ -35,7 +36,6 @@ from unshade.relight import relight
 from unshade.render import render
 from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
 from unshade.synthesis import trees
-from unshade.transfer import transfer
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS, PAGE, FIGURE = (ROOT / path for path in ("benchmarks/results/reflections.json", "docs/reflections.md", "docs/reflections.png"))

@@ -16,8 +16,9 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from unshade.apply import apply_to_photo, shade_shape
+from unshade.assignment import read_color
 from unshade.decompose import decompose
-from unshade.edit import move_light, read_color
+from unshade.edit import move_light
 from unshade.extract import Extraction, from_drawing, from_mask, from_normal_map
 from unshade.mesh import Mesh, View, compute_normals, render_mesh
 from unshade.nodes import Tree

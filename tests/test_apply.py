@@ -11,7 +11,7 @@ import torch
 
 import photo_scenes as scenes
 from unshade.apply import apply_to_photo, shade
-from unshade.edit import read_color
+from unshade.assignment import read_color
 from unshade.errors import PictureError, TreeError
 from unshade.mesh import Mesh, View, compute_normals, look, read_mesh, render_mesh
 from unshade.metrics import psnr

@@ -13,7 +13,8 @@ import torch
 from hypothesis import given
 
 from strategies import trees
-from unshade.edit import harden, move_light, read_color, remove, rename, set_value, soften
+from unshade.assignment import read_color
+from unshade.edit import harden, move_light, remove, rename, set_value, soften
 from unshade.edit_script import EditScript
 from unshade.errors import AddressError, TreeError
 from unshade.library import library_html, parts

@@ -7,13 +7,13 @@ import torch
 
 from unshade.analogy import Seen, explain
 from unshade.components import Component
+from unshade.edit import transfer
 from unshade.environments import raster
 from unshade.nodes import Leaf, Operator, Raster, Tree
 from unshade.ratio import Ratio, moved
 from unshade.render import render
 from unshade.serde import parse
 from unshade.sphere import disc_mask, sphere_normals
-from unshade.transfer import transfer
 from unshade.types import Image
 
 DISC = disc_mask(256)

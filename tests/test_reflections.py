@@ -16,6 +16,7 @@ from unshade.circles import edge_circles, edge_masks
 from unshade.cli import run as run_command
 from unshade.components import Component
 from unshade.decompose import Result, decompose
+from unshade.edit import transfer
 from unshade.environments import raster
 from unshade.errors import MissingWeightsError, TreeError, UnshadeError
 from unshade.experiments import methods
@@ -30,7 +31,6 @@ from unshade.render import render
 from unshade.separation import Separation
 from unshade.serde import parse
 from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
-from unshade.transfer import transfer
 from unshade.types import Image
 
 DISC, SCORED = disc_mask(256), disc_mask(256, SCORED_RADIUS)

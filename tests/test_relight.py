@@ -16,6 +16,7 @@ from PIL import Image as PILImage
 
 from strategies import trees
 from unshade.components import Component
+from unshade.edit import component
 from unshade.errors import MissingExtraError, OutputError, PictureError, TreeError
 from unshade.metrics import psnr
 from unshade.nodes import Raster, Tree, leaf
@@ -36,7 +37,6 @@ from unshade.serde import parse
 from unshade.shading import rotate
 from unshade.sphere import disc_mask, sphere_normals
 from unshade.surroundings import Surroundings, under
-from unshade.transfer import component
 from unshade.turntable import directions, frame, lighting, turntable, write_turntable
 
 PAINT = "mix(albedo(red), albedo(blue), stripe(up))"

@@ -11,7 +11,7 @@ from hypothesis import given
 from strategies import trees
 from unshade.analogy import analogy
 from unshade.components import Component, put_together, take_apart, uses
-from unshade.edit import move_light, remove, set_value
+from unshade.edit import component, components, mix, move_light, remove, set_value, transfer
 from unshade.errors import PictureError, TreeError
 from unshade.grammar import sample
 from unshade.metrics import psnr
@@ -20,7 +20,6 @@ from unshade.render import render
 from unshade.replay import match, replay
 from unshade.serde import parse
 from unshade.sphere import sphere_normals
-from unshade.transfer import component, components, mix, transfer
 
 NORMALS = sphere_normals(32, dtype=torch.float64)
 

@@ -19,6 +19,7 @@ import torch
 
 from unshade.components import Component
 from unshade.decompose import decompose
+from unshade.edit import component, transfer
 from unshade.errors import PictureError, TreeError
 from unshade.metrics import psnr
 from unshade.nodes import Tree
@@ -26,7 +27,6 @@ from unshade.pictures import SIZE, SphereImage, read_sphere, sphere_from_array
 from unshade.ratio import moved, thinned
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
-from unshade.transfer import component, transfer
 from unshade.types import Image, Mask
 
 Source: TypeAlias = "Tree | SphereImage | torch.Tensor | str | Path"

@@ -215,7 +215,7 @@ def recolor(color: str, trees: tuple[str, ...], where: str | None, output: Path,
       unshade recolor "#3366ff" out/ball -o blue.json --render blue.png
       unshade recolor teal out/*/ -o teal
     """
-    from unshade.edit import read_color
+    from unshade.assignment import read_color
     from unshade.recolor import recolor as recolored
 
     wanted = read_color(color)

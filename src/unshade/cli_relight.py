@@ -73,7 +73,7 @@ def relight(
       unshade relight out/ball --environment studio.hdr -o studio.json --turntable studio.mp4
     """
     from unshade import relight as lights
-    from unshade.edit import read_direction
+    from unshade.assignment import read_direction
     from unshade.nodes import Tree, leaf
     from unshade.picture_output import check_picture, write_picture
     from unshade.surroundings import Surroundings, under

@@ -36,7 +36,7 @@ def transfer(component: str, source: str, trees: tuple[str, ...], output: Path, 
       unshade transfer albedo out/gold out/ball -o gold_ball.json --render gold_ball.png
       unshade transfer highlights out/lacquer out/*/ -o lacquered
     """
-    from unshade.transfer import transfer as moved
+    from unshade.edit import transfer as moved
 
     given = read_tree(source)
     apply_to(trees, lambda tree: moved(given, tree, component), output, picture, [source])
@@ -54,7 +54,7 @@ def mix(first: str, second: str, take: tuple[str, ...], output: Path, picture: P
     Examples:
       unshade mix out/ball out/gold --take albedo --take highlights -o mixed.json --render mixed.png
     """
-    from unshade.transfer import mix as mixed
+    from unshade.edit import mix as mixed
 
     other = read_tree(second)
     apply_to([first], lambda tree: mixed(tree, other, take), output, picture, [second])

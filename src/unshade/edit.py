@@ -1,54 +1,47 @@
 """Edits: functions from a tree to a tree. Trees are frozen, so the one before an edit is still there to go back to.
 
-Every edit takes addresses as `selection.select` reads them, and raises AddressError for one that stands for nothing and
+Edits of one tree take addresses as `selection.select` reads them, and raise AddressError for one that stands for nothing and
 TreeError for a value that its parameter cannot take.
+
+`transfer` moves a component of one tree into another: its paint, its form, its highlights, its rim or its environment. The parts
+are those of `components`. What is not moved stays as it is, bit for bit, but for broad lights of the colour of the paint, which
+take on the colour of the paint that they now lie on (`recolor.recast`). Paint over the whole (a drawn edge) belongs to the
+picture rather than to a component and stays with the tree it is in.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterable
 
-from unshade.components import Component, is_paint, uses
+from unshade.assignment import Assignment
+from unshade.components import (
+    BLACK,
+    WHITE,
+    Base,
+    Body,
+    Component,
+    Light,
+    Lit,
+    Over,
+    Part,
+    Sides,
+    is_paint,
+    join,
+    put_together,
+    reflecting,
+    take_apart,
+    uses,
+)
 from unshade.errors import TreeError
-from unshade.nodes import BROAD_SHARPNESS, KINDS, Leaf, Node, Parameter, Raster, Role, Tree, Value, find
+from unshade.nodes import BROAD_SHARPNESS, KINDS, Leaf, Node, Operator, Parameter, Role, Tree, find
+from unshade.recolor import mean_color, recast
 from unshade.relight import rebuild, turn, turn_of
 from unshade.selection import holders, select, select_all, select_one
-from unshade.text import parse
 
 EDGE = 0.05
 """Added to an edge's softness before it is scaled, so that a hard edge can be softened."""
-
-OPERATIONS: dict[str, Callable[[float, float], float]] = {
-    "=": lambda old, new: new,
-    "*=": lambda old, new: old * new,
-    "/=": lambda old, new: old / new,
-    "+=": lambda old, new: old + new,
-    "-=": lambda old, new: old - new,
-}
-
-FORM = re.compile(r"\s*(?P<where>.+?)\.(?P<parameter>\w+)\s*(?P<operation>[*/+-]?=)\s*(?P<value>.*?)\s*", re.DOTALL)
-
-
-@dataclass(frozen=True)
-class Assignment:
-    """``ADDRESS.PARAMETER=VALUE``, or with ``*=``, ``/=``, ``+=`` or ``-=``."""
-
-    where: str
-    parameter: str
-    operation: str
-    value: str
-
-    @staticmethod
-    def of(text: str) -> Assignment:
-        """Read ``multiply.0.color=#3366ff``. Raises TreeError."""
-        found = FORM.fullmatch(text)
-        if found is None:
-            raise TreeError(f"expected ADDRESS.PARAMETER=VALUE such as highlight.sharpness*=2, got {text!r}")
-        return Assignment(**found.groupdict())
 
 
 def set_value(tree: Tree, assignment: str | Assignment) -> Tree:
@@ -57,6 +50,7 @@ def set_value(tree: Tree, assignment: str | Assignment) -> Tree:
     ``=`` takes what the text form takes: a number, ``#hex`` or a word for a colour, three numbers or words for a direction.
     The other operations take a number, or one a channel, and stop at the end of the parameter's range.
 
+    >>> from unshade.text import parse
     >>> tree = parse("screen(multiply(albedo(red), diffuse()), highlight())")
     >>> set_value(tree, "highlight.sharpness*=2").find("highlight")["sharpness"]
     (60.0,)
@@ -65,7 +59,7 @@ def set_value(tree: Tree, assignment: str | Assignment) -> Tree:
     changed = {}
     for address, leaf in holders(tree.root, given.where, given.parameter):
         parameter = KINDS[leaf.kind].parameter(given.parameter)
-        changed[address] = with_value(leaf, parameter, _assigned(parameter, leaf[parameter.name], given), address)
+        changed[address] = with_value(leaf, parameter, given.of_value(parameter, leaf[parameter.name]), address)
     return dataclasses.replace(tree, root=rebuild(tree.root, changed))
 
 
@@ -75,68 +69,6 @@ def with_value(leaf: Leaf, parameter: Parameter, value: object, address: str) ->
         return leaf.set(**{parameter.name: value})
     except TreeError as error:
         raise TreeError(str(error), address) from None
-
-
-def _assigned(parameter: Parameter, old: Value, given: Assignment) -> tuple[float, ...]:
-    where = f"{given.where}.{given.parameter}"
-    if isinstance(old, Raster):
-        raise TreeError(f"{where} is a picture, which an edit cannot set")
-    lobes = len(old) // parameter.size
-    if given.operation == "=":
-        return _read(parameter, given.value, where) * lobes
-    if parameter.type == "direction":
-        raise TreeError(f"{where} is a direction: set it with =, or move it by degrees")
-    numbers = _numbers(given.value, where)
-    if len(numbers) not in (1, parameter.size):
-        raise TreeError(f"{where}: expected 1{' or 3' * (parameter.size == 3)} numbers after {given.operation}, got {given.value!r}")
-    if given.operation == "/=" and 0.0 in numbers:
-        raise TreeError(f"{where}: cannot be divided by 0")
-    factors = numbers * (len(old) // len(numbers))
-    changed = (OPERATIONS[given.operation](number, factor) for number, factor in zip(old, factors, strict=True))
-    return tuple(min(max(number, parameter.low), parameter.high) for number in changed)
-
-
-def _read(parameter: Parameter, text: str, where: str) -> tuple[float, ...]:
-    """A value in any of the forms that the text of a tree may have."""
-    if parameter.type in ("scalar", "rotation"):
-        numbers = _numbers(text, where)
-        if len(numbers) != parameter.size:
-            raise TreeError(f"{where}: expected {parameter.size} number{'s' * (parameter.size > 1)}, got {text!r}")
-        return numbers
-    return read_color(text, where) if parameter.type == "color" else read_direction(text, where)
-
-
-def read_color(text: str, where: str = "colour") -> tuple[float, ...]:
-    """``#rgb``, ``#rrggbb``, a word, or three numbers in [0, 1]. Raises TreeError."""
-    return _sugar("albedo", "color", text, where)
-
-
-def read_direction(text: str, where: str = "direction") -> tuple[float, ...]:
-    """Words such as ``left up``, or three numbers. Raises TreeError."""
-    return _sugar("diffuse", "direction", text, where)
-
-
-def _sugar(kind: str, parameter: str, text: str, where: str) -> tuple[float, ...]:
-    written = f"({text})" if "," in text and "(" not in text else text
-    try:
-        leaf = parse(f"{kind}({parameter}={written})").root
-    except TreeError as error:
-        # The column would be that of the sentence made here, not of what was given.
-        reason = str(error).partition("\n")[0].partition(": ")[2] or str(error)
-        what = reason.removeprefix(f"{kind}.{parameter}: ")
-        raise TreeError(f"{where}: {what}" + ("" if repr(text) in what else f" (in {text!r})")) from None
-    assert isinstance(leaf, Leaf)
-    return tuple(leaf[parameter])
-
-
-def _numbers(text: str, where: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(part) for part in text.strip("() ").split(","))
-    except ValueError:
-        numbers = (math.nan,)
-    if not all(math.isfinite(number) for number in numbers):
-        raise TreeError(f"{where}: expected a number, got {text!r}")
-    return numbers
 
 
 def move_light(tree: Tree, right: float, up: float = 0.0, roll: float = 0.0, where: str | None = None) -> Tree:
@@ -251,3 +183,161 @@ def _softened(leaf: Leaf, factor: float, broadest: float) -> Leaf:
                 leaf = leaf.set(threshold=min(max(begin, start.low), start.high))
             leaf = leaf.set(softness=new)
     return leaf
+
+
+def component(tree: Tree, which: Component | str) -> Node | None:
+    """What a tree has of a component, as one node; None where it has none of it."""
+    which = Component.of(which) if isinstance(which, str) else which
+    lit = take_apart(tree.root)
+    if which is Component.ALBEDO:
+        return _paint(lit)
+    nodes = _lights(lit, which)
+    if which is Component.DIFFUSE:
+        form = _form(lit)
+        nodes = [*([form] if form is not None else []), *nodes]
+    return join("screen", nodes) if nodes else None
+
+
+def components(tree: Tree) -> dict[Component, Node]:
+    """All that a tree has."""
+    found = {which: component(tree, which) for which in Component}
+    return {which: node for which, node in found.items() if node is not None}
+
+
+def transfer(source: Tree, target: Tree, which: Component | str, stand_ins: bool = False) -> Tree:
+    """The target with a component of the source in the place of its own; where the source has none, without it.
+
+    ``stand_ins``: count lights that may stand for a reflected photograph to the environment (`components.reflecting`).
+
+    Raises TreeError for trees of different blend spaces, whose numbers mean different things.
+    """
+    which = Component.of(which) if isinstance(which, str) else which
+    if source.blend_space != target.blend_space:
+        raise TreeError(f"cannot move {which.value} from a tree that blends in {source.blend_space} to one in {target.blend_space}")
+    theirs, ours = take_apart(source.root), take_apart(target.root)
+    if stand_ins:
+        theirs, ours = reflecting(theirs), reflecting(ours)
+    old, new = (_paint_color(lit) for lit in (ours, theirs))
+    if which is Component.ALBEDO:
+        paint = _paint(theirs)
+        changed = _repainted(ours, (paint,) if paint is not None else (), old, new)
+    elif which is Component.DIFFUSE:
+        form = _form(theirs)
+        broad = [recast(light, new, old) for light in _lights(theirs, which)]
+        changed = _relit(_formed(ours, (form,) if form is not None else ()), which, broad)
+    else:
+        changed = _relit(ours, which, _lights(theirs, which))
+    return dataclasses.replace(target, root=put_together(changed))
+
+
+def mix(first: Tree, second: Tree, take: Iterable[Component | str]) -> Tree:
+    """The first tree with these components of the second."""
+    for which in take:
+        first = transfer(second, first, which)
+    return first
+
+
+def _paint(lit: Lit | Base) -> Node | None:
+    """The paint of a tree as one node; None where it has neither paint nor form, which is black."""
+    if isinstance(lit, Base):
+        if not lit.paint and not lit.form:
+            return None
+        return join("multiply", [part.node for part in lit.paint])
+    if isinstance(lit, Body):
+        return _paint(lit.base)
+    if isinstance(lit, Over):
+        return _paint(lit.under)
+    return _mixed(_paint(lit.left), _paint(lit.right), lit.mask, BLACK)
+
+
+def _form(lit: Lit | Base) -> Node | None:
+    """The form as one node; None where the paint is flat."""
+    if isinstance(lit, Base):
+        return join("multiply", [part.node for part in lit.form]) if lit.form else None
+    if isinstance(lit, Body):
+        return _form(lit.base)
+    if isinstance(lit, Over):
+        return _form(lit.under)
+    return _mixed(_form(lit.left), _form(lit.right), lit.mask, WHITE)
+
+
+def _mixed(left: Node | None, right: Node | None, mask: Part, nothing: Node) -> Node | None:
+    if left == right:
+        return left
+    assert isinstance(mask.node, Leaf)
+    return Operator("mix", (left or nothing, right or nothing), mask.node)
+
+
+def _lights(lit: Lit, which: Component) -> list[Node]:
+    if isinstance(lit, Body):
+        inside = _lights(lit.base, which) if isinstance(lit.base, Sides) else []
+        return [*inside, *(light.part.node for light in lit.lights if light.component is which)]
+    if isinstance(lit, Over):
+        return _lights(lit.under, which)
+    left, right = _lights(lit.left, which), _lights(lit.right, which)
+    shared = [node for node in left if node in right]
+    only = [[node for node in side if node not in shared] for side in (left, right)]
+    if not any(only):
+        return shared
+    mixed = _mixed(join("screen", only[0]), join("screen", only[1]), lit.mask, BLACK)
+    return [*shared, *([mixed] if mixed is not None else [])]
+
+
+def _paint_color(lit: Lit) -> tuple[float, ...]:
+    paint = _paint(lit)
+    return mean_color(paint) if paint is not None else (1.0, 1.0, 1.0)
+
+
+def _parts(nodes: Iterable[Node]) -> tuple[Part, ...]:
+    return tuple(Part("", node) for node in nodes)
+
+
+def _repainted(lit: Lit, paint: tuple[Node, ...], old: tuple[float, ...], new: tuple[float, ...]) -> Lit:
+    """Another paint in every base, broad lights with it."""
+    if isinstance(lit, Over):
+        return dataclasses.replace(lit, under=_repainted(lit.under, paint, old, new))
+    if isinstance(lit, Sides):
+        left, right = (_repainted(side, paint, old, new) for side in (lit.left, lit.right))
+        return dataclasses.replace(lit, left=left, right=right)
+    lights = tuple(
+        Light(light.component, Part("", recast(light.part.node, old, new))) if light.component is Component.DIFFUSE else light
+        for light in lit.lights
+    )
+    if isinstance(lit.base, Sides):
+        inner = _repainted(lit.base, paint, old, new)
+        assert isinstance(inner, Sides)
+        return dataclasses.replace(lit, base=inner, lights=lights)
+    base = dataclasses.replace(lit.base, paint=_parts(paint or (BLACK,)))
+    return dataclasses.replace(lit, base=base, lights=lights)
+
+
+def _formed(lit: Lit, form: tuple[Node, ...]) -> Lit:
+    """Another form in every base."""
+    if isinstance(lit, Over):
+        return dataclasses.replace(lit, under=_formed(lit.under, form))
+    if isinstance(lit, Sides):
+        return dataclasses.replace(lit, left=_formed(lit.left, form), right=_formed(lit.right, form))
+    if isinstance(lit.base, Sides):
+        inner = _formed(lit.base, form)
+        assert isinstance(inner, Sides)
+        return dataclasses.replace(lit, base=inner)
+    if not lit.base.paint and not lit.base.form:
+        return lit
+    paint = lit.base.paint or _parts((WHITE,))
+    return dataclasses.replace(lit, base=dataclasses.replace(lit.base, paint=paint, form=_parts(form)))
+
+
+def _relit(lit: Lit, which: Component, lights: Iterable[Node]) -> Lit:
+    """Other lights of one component, on top of what has a base; those inside are gone."""
+    nodes = list(lights)
+    if isinstance(lit, Over):
+        return dataclasses.replace(lit, under=_relit(lit.under, which, nodes))
+    if isinstance(lit, Sides):
+        return dataclasses.replace(lit, left=_relit(lit.left, which, nodes), right=_relit(lit.right, which, nodes))
+    base: Base | Sides = lit.base
+    if isinstance(base, Sides):
+        inner = _relit(base, which, ())
+        assert isinstance(inner, Sides)
+        base = inner
+    kept = tuple(light for light in lit.lights if light.component is not which)
+    return dataclasses.replace(lit, base=base, lights=(*kept, *(Light(which, part) for part in _parts(nodes))))

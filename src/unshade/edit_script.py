@@ -25,7 +25,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from unshade.edit import harden, move_light, read_color, read_direction, remove, rename, set_value, soften
+from unshade.assignment import read_color, read_direction
+from unshade.edit import harden, move_light, remove, rename, set_value, soften
 from unshade.errors import AddressError, TreeError, did_you_mean
 from unshade.nodes import Tree
 from unshade.recolor import recolor

@@ -19,6 +19,7 @@ from PIL import Image as PILImage
 
 from unshade.color_profiles import srgb_decode
 from unshade.components import WHITE, Component, Part, join, leaves_below
+from unshade.edit import component, mix
 from unshade.errors import PictureError
 from unshade.fit.least_squares import fit_pixels
 from unshade.fit.pixels import Pixels
@@ -28,7 +29,6 @@ from unshade.relight import lit_leaves, turn, turn_between
 from unshade.render import render, srgb_encode
 from unshade.render import srgb_decode as decode
 from unshade.sphere import disc_mask, sphere_normals
-from unshade.transfer import component, mix
 from unshade.turntable import directions
 from unshade.types import Image
 

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from unshade.components import Component, uses
+from unshade.edit import component
 from unshade.errors import TreeError, did_you_mean
 from unshade.nodes import KINDS, Leaf, Role, Tree, find
 from unshade.recolor import mean_color, recolor
 from unshade.relight import rebuild, turn, turn_of
 from unshade.render import srgb_encode
-from unshade.transfer import component
 from unshade.types import Image
 
 ASPECTS = ("light", "color", "shape")
