@@ -1,6 +1,9 @@
-"""Search, learned and hybrid side by side, at their own time and at equal time; the table goes into docs/learned.md.
+"""Search, learned and hybrid side by side, at their own time and at equal time, and the seconds of the first stage's budgets on all cores.
 
-    python scripts/measure_learned.py --weights run/weights --data ../shared/data --count 20
+    python scripts/measure_learned.py --weights run/weights --data DIR --count 20
+    python scripts/measure_learned.py --part seconds      # with nothing else running
+
+Both tables go into docs/learned.md, the rows behind them into benchmarks/results/learned.json.
 
 Synthetic pictures are unseen trees of both styles. ``told`` rows replace the priors and the type network by the true children and types,
 passed through the VQ-VAE: what the rest of the method would make of perfect proposals. They need no trained prior.
@@ -22,8 +25,10 @@ from typing import Any
 import torch
 
 from unshade import synthesis
+from unshade.bench.report import machine
 from unshade.decompose import decompose
-from unshade.inference import Networks
+from unshade.inference import Inference, Networks
+from unshade.learned import Settings
 from unshade.models import weights
 from unshade.models.prior import Priors
 from unshade.models.vqvae import VQVAE, Codes
@@ -33,8 +38,15 @@ from unshade.presets import PRESETS
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
 
-PAGE = Path(__file__).parent.parent / "docs" / "learned.md"
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+ROOT = Path(__file__).resolve().parent.parent
+PAGE, RESULTS = ROOT / "docs" / "learned.md", ROOT / "benchmarks" / "results" / "learned.json"
+PARTS = ("table", "seconds")
+
+DRAWS = (12, 18, 64)
+"""Budgets of nodes to draw for (`Inference.draws`) whose seconds are measured."""
+
+TIMED = 5
+"""Trees of each style that they are measured on."""
 
 MORE = dataclasses.replace(PRESETS["balanced"].effort, beam=4, beam_moves=8, trials=8, rounds=4, sweeps=2, settle_steps=28)
 """A search with about the hybrid's time."""
@@ -73,10 +85,15 @@ class Told:
         return torch.nn.functional.one_hot(torch.tensor(numbers), len(synthesis.TYPES)).float()
 
 
-def cases(args: argparse.Namespace) -> Iterator[tuple[str, SphereImage, Tree | None]]:
+def unseen(seed: int, count: int) -> Iterator[tuple[str, SphereImage, Tree]]:
+    """Trees of the test half, so many of each style, with their pictures."""
     for style in ("realistic", "toon"):
-        for tree in islice(synthesis.trees(style, "test", seed=args.seed), args.count):
+        for tree in islice(synthesis.trees(style, "test", seed=seed), count):  # type: ignore[arg-type]
             yield style, sphere_from_array((render(tree, sphere_normals(256)) * 255.0).round() / 255.0), tree
+
+
+def cases(args: argparse.Namespace) -> Iterator[tuple[str, SphereImage, Tree | None]]:
+    yield from unseen(args.seed, args.count)
     for name in ("pbr", "wild"):
         folder = args.data / name if args.data else None
         paths = [p for p in find_pictures([folder]) if "." not in p.stem] if folder and folder.is_dir() else []
@@ -118,15 +135,8 @@ def table(rows: dict[str, dict[str, list[dict[str, Any]]]]) -> list[str]:
     return lines
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--weights", type=Path, default=weights.FOLDER)
-    parser.add_argument("--data", type=Path)
-    parser.add_argument("--count", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=7)
-    parser.add_argument("--methods", default="search;search, more;learned told;hybrid told;learned;hybrid")
-    parser.add_argument("--json", type=Path, default=Path("benchmarks/results/learned.json"))
-    args = parser.parse_args()
+def compared(args: argparse.Namespace) -> dict[str, Any]:
+    """Every method on every picture, on one thread."""
     torch.set_num_threads(1)
     PRESETS["more"] = dataclasses.replace(PRESETS["balanced"], name="more", effort=MORE)
     vqvae, heads = weights.load("vqvae", args.weights), weights.load("heads", args.weights)
@@ -140,17 +150,76 @@ def main() -> None:
             if row is not None:
                 rows.setdefault(dataset, {}).setdefault(method, []).append(row)
                 print(number, dataset, method, {key: value for key, value in row.items() if key != "stages"}, flush=True)
-    lines = table(rows)
-    print("\n".join(lines))
     cards = {
         name: weights.read_card(weights.file_of(name, args.weights)).get("steps") for name in weights.MODELS if full or name != "prior"
     }
-    args.json.write_text(json.dumps({"steps": cards, "cores": os.cpu_count(), "rows": rows}, indent=1) + "\n", encoding="utf-8")
-    text = PAGE.read_text(encoding="utf-8")
-    before, after = text.split(BEGIN)[0], text.split(END)[1]
-    trained = ", ".join(f"{name} {steps} steps" for name, steps in cards.items())
-    block = f"{BEGIN}\nNetworks: {trained}. Seed {args.seed}; one thread of a busy machine.\n\n" + "\n".join(lines) + f"\n{END}"
-    PAGE.write_text(before + block + after, encoding="utf-8")
+    return {"steps": cards, "seed": args.seed, "rows": rows}
+
+
+def told(found: dict[str, Any]) -> str:
+    trained = ", ".join(f"{name} {steps} steps" for name, steps in found["steps"].items())
+    return f"Networks: {trained}. Seed {found['seed']}; one thread of a busy machine.\n\n" + "\n".join(table(found["rows"]))
+
+
+def timed(args: argparse.Namespace) -> dict[str, Any]:
+    """``learned`` with each budget, on all cores."""
+    torch.set_num_threads(os.cpu_count() or 1)
+    rows = []
+    for number, (style, sphere, _) in enumerate(unseen(args.seed, TIMED)):
+        for draws in DRAWS:
+            begin = time.perf_counter()
+            result = decompose(sphere, method="learned", settings=Settings(Inference(draws=draws)), weights=args.weights).result()
+            seconds = time.perf_counter() - begin
+            assert result.stages is not None
+            row = {"tree": number, "style": style, "draws": draws, "seconds": round(seconds, 2), "psnr": round(result.psnr, 2)}
+            rows.append(row | {"drawn": result.stages["drawn_nodes"], "stages": result.stages["seconds"]})
+            print({key: value for key, value in rows[-1].items() if key != "stages"}, flush=True)
+    return {"seed": args.seed, "machine": machine(), "rows": rows}
+
+
+def budgets(found: dict[str, Any]) -> str:
+    lines = [
+        f"{2 * TIMED} unseen trees, seed {found['seed']}; wall seconds on {found['machine']['cores']} cores with nothing else running.",
+        "",
+        "| `Inference.draws` | seconds: least / median / most | in 20 seconds | of them drawing, median | PSNR, dB: median / mean |",
+        "|---|---|---|---|---|",
+    ]
+    for draws in DRAWS:
+        rows = [row for row in found["rows"] if row["draws"] == draws]
+        seconds, psnr = sorted(row["seconds"] for row in rows), [row["psnr"] for row in rows]
+        drawing = statistics.median(row["stages"]["first stage"] for row in rows)
+        spread = f"{seconds[0]:.0f} / {statistics.median(seconds):.1f} / {seconds[-1]:.0f}"
+        quick = f"{sum(number <= 20.0 for number in seconds)} of {len(rows)}"
+        lines.append(f"| {draws} | {spread} | {quick} | {drawing:.1f} | {statistics.median(psnr):.1f} / {statistics.fmean(psnr):.1f} |")
+    return "\n".join(lines)
+
+
+def placed(page: str, part: str, text: str) -> str:
+    """The page with a table in its place."""
+    begin, end = f"<!-- {part}: begin -->", f"<!-- {part}: end -->"
+    return page.split(begin)[0] + f"{begin}\n{text}\n{end}" + page.split(end)[1]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", choices=PARTS, help="one of the tables; both when not given")
+    parser.add_argument("--weights", type=Path, default=weights.FOLDER)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--methods", default="search;search, more;learned told;hybrid told;learned;hybrid")
+    args = parser.parse_args()
+    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.is_file() else {}
+    page = PAGE.read_text(encoding="utf-8")
+    # The seconds first: the other part puts its own networks in the place of those that ship.
+    if args.part in (None, "seconds"):
+        results["seconds"] = timed(args)
+        page = placed(page, "seconds", budgets(results["seconds"]))
+    if args.part in (None, "table"):
+        results["table"] = compared(args)
+        page = placed(page, "table", told(results["table"]))
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    PAGE.write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":
