@@ -22,6 +22,8 @@ from unshade.experiments.options import METHODS, PARTS
 from unshade.experiments.pieces import pieces, swapped
 from unshade.experiments.runner import write_page
 from unshade.experiments.summaries import best_within, figures
+from unshade.inference import Inference
+from unshade.learned import Settings
 from unshade.metrics import psnr
 from unshade.models import weights
 from unshade.models.config import find
@@ -121,7 +123,22 @@ def test_other_weights_are_another_method(tmp_path: Path, folder: Path) -> None:
     card = weights.read_card(weights.file_of("lstm", folder))
     weights.save(weights.file_of("lstm", tmp_path), "lstm", weights.BASELINES["lstm"](find("tiny")), find("tiny"), card)
     assert methods.digest("lstm", tmp_path) != before
-    assert methods.digest("search:draft", folder) == ""
+
+
+def test_other_settings_are_another_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {
+        method: methods.digest(method, None) for method in ("search:draft", "search:best", "hybrid:draft", "learned", "learned:alone")
+    }
+    assert len(set(before.values())) == len(before)
+    assert methods.digest("learned", None) == methods.digest("learned:full", None)
+    monkeypatch.setitem(methods.VARIANTS, "full", Settings(Inference(draws=3)))
+    assert methods.digest("learned", None) != before["learned"]
+    assert methods.digest("learned:alone", None) == before["learned:alone"]
+
+
+def test_rows_name_the_code_that_measured(tmp_path: Path, data: Path) -> None:
+    rows = run(options(tmp_path, data, None, "search:draft", parts=("wild",)), Console(quiet=True)).documents["wild"]["rows"]
+    assert {row["commit"] for row in rows} == {jobs.commit()}
 
 
 def test_what_is_missing_is_named(tmp_path: Path, data: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

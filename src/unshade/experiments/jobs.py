@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -27,7 +29,7 @@ from unshade.sphere import sphere_normals
 Row = dict[str, Any]
 
 KEY = ("kind", "dataset", "name", "method", "damage", "seed", "weights", "perceptual")
-"""What a row is found again by: what was asked, with which weights; not the code that answered."""
+"""What a row is found again by: what was asked, with which settings and weights; not the code that answered, which stands in the row."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class Job:
     folder: Path | None
     """Of the weights."""
     digest: str
+    """Of the method's settings and weights."""
     perceptual: bool = False
     damage: str = CLEAN
     question: Question | None = None
@@ -71,9 +74,19 @@ def row_of(job: Job) -> Row:
     """What a job comes to; a row with ``error`` where it failed, so that one picture does not end the run."""
     torch.set_num_threads(1)
     try:
-        return job.about | {"tree": _tree, "time": _time, "analogy": _analogy}[job.kind](job)
+        return job.about | {"commit": commit()} | {"tree": _tree, "time": _time, "analogy": _analogy}[job.kind](job)
     except (UnshadeError, ArithmeticError, ImportError, RuntimeError, ValueError) as error:
         return job.about | {"error": f"{type(error).__name__}: {error}"}
+
+
+@lru_cache(maxsize=1)
+def commit() -> str:
+    """Of the code that measures, ``-dirty`` where it was changed since; empty outside a clone."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude", "*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
 
 
 def _tree(job: Job) -> Row:

@@ -2,7 +2,7 @@
 
 - ``cnn``, ``lstm``, ``transformer``: the baselines; with ``+fit`` our fit of the whole tree goes over what they found.
 - ``learned``: the paper's method; ``learned:base``, ``learned:samples``, ``learned:second``, ``learned:overall`` and
-  ``learned:full`` are its ablation; ``learned:alone`` has no second stage, ``learned:depth`` the paper's own, minutes a picture.
+  ``learned`` itself (or ``learned:full``) are its ablation; ``learned:alone`` has no second stage, ``learned:depth`` the paper's own, minutes a picture.
 - ``search:PRESET``, ``hybrid:PRESET``: ours; with ``+reflections`` a reflected environment is held as a picture.
 """
 
@@ -16,7 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from unshade import baselines
+from unshade import baselines, learned
 from unshade.decompose import Decomposition, decompose, fit
 from unshade.errors import MissingWeightsError, UnshadeError, did_you_mean
 from unshade.inference import Inference
@@ -103,14 +103,22 @@ def _models(name: Name) -> tuple[str, ...]:
 
 
 def digest(method: str, folder: Path | None) -> str:
-    """A short mark of the weights that a method uses, empty where it uses none; other weights are another method."""
+    """A short mark of a method's settings and weights: with others of either it is another method."""
     paths = [weights.file_of(model, folder) for model in _models(name_of(method))]
-    return _digest(tuple((path, path.stat().st_mtime_ns) for path in paths)) if paths else ""
+    return _digest(repr(_settings(method)), tuple((path, path.stat().st_mtime_ns) for path in paths))
+
+
+def _settings(method: str) -> tuple[Any, ...]:
+    """What a method's numbers are set to, where it has such."""
+    name = name_of(method)
+    preset = PRESETS[name.argument] if name.argument in PRESETS else PRESETS["balanced"] if name.kind in ("search", *NETWORKS) else None
+    networks = {"learned": VARIANTS.get(name.argument or "full"), "hybrid": learned.PROPOSED}.get(name.kind)
+    return preset, networks
 
 
 @lru_cache(maxsize=16)
-def _digest(files: tuple[tuple[Path, int], ...]) -> str:
-    total = hashlib.sha256()
+def _digest(settings: str, files: tuple[tuple[Path, int], ...]) -> str:
+    total = hashlib.sha256(settings.encode())
     for path, _ in files:
         total.update(path.read_bytes())
     return total.hexdigest()[:12]

@@ -213,7 +213,7 @@ def _ablation(document: Document) -> Iterator[str]:
     yield (
         "`learned:base` draws one sample a node and nothing else; `samples` draws several, picks by the criterion and keeps\n"
         "three trees side by side; `second` adds the second stage for the nodes left over; `overall` adds the optimisation of the\n"
-        "whole tree, and is all of the paper's method; `full` looks at nodes left over again in their place in the tree, which is\n"
+        "whole tree, and is all of the paper's method; `learned` looks at nodes left over again in their place in the tree, which is\n"
         "ours and the default."
     )
     yield ""

@@ -27,6 +27,9 @@ from unshade.sphere import sphere_normals
 SETS = (*STYLES, "pbr", "wild")
 SHOWN_SETS = ("layered", "pbr", "drawings")
 
+PAPERS = "learned:overall"
+"""The paper's method and nothing of ours, which stands beside it in the table of decomposition."""
+
 ANALOGIES = 300
 """Of each component."""
 
@@ -83,7 +86,8 @@ Document = dict[str, Any]
 
 def decomposition(context: Context) -> tuple[Document, list[Row]]:
     """Experiment 1: every method on both styles and on real spheres."""
-    used = [*context.methods, *(f"{method}{methods.FIT}" for method in context.methods if method in BASELINES), *context.reflecting]
+    used = [entry for method in context.methods for entry in ((PAPERS, method) if method == "learned" else (method,))]
+    used += [*(f"{method}{methods.FIT}" for method in context.methods if method in BASELINES), *context.reflecting]
     jobs = [
         context.job("tree", case, method, perceptual=context.perceptual)
         for dataset in SETS
