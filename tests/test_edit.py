@@ -93,6 +93,8 @@ def test_set_value() -> None:
     doubled = set_value(BALL, "highlight.sharpness *= 2")
     assert [doubled.find(a)["sharpness"] for a in select(BALL.root, "highlight")] == [(120.0,), (80.0,), (4.0,)]  # type: ignore[index]
     assert set_value(BALL, "key.direction=right").find("key")["direction"] == (1.0, 0.0, 0.0)  # type: ignore[index]
+    for twenty in ("20", "(20)", " ( 20 ) "):
+        assert set_value(BALL, f"key.sharpness={twenty}").find("key")["sharpness"] == (20.0,)  # type: ignore[index]
     assert set_value(BALL, "key.direction=0,0,-2").find("key")["direction"] == (0.0, 0.0, -1.0)  # type: ignore[index]
     assert set_value(BALL, "screen.2.color/=2").find("screen.2.multiply.0")["color"][0] == 0.5  # type: ignore[index]
     assert dumps(BALL) == before, "the tree before an edit is still there"
@@ -117,6 +119,10 @@ def test_lobes_are_set_together() -> None:
         ("key.sharpness", "expected ADDRESS.PARAMETER=VALUE"),
         ("key.sharpness=many", "expected a number, got 'many'"),
         ("key.sharpness=1e999", "expected a number"),
+        ("key.sharpness=((20", "expected a number, got '((20'"),
+        ("key.sharpness=(20", "expected a number"),
+        ("key.sharpness=20)", "expected a number"),
+        ("key.sharpness=((20))", "expected a number"),
         ("key.sharpness=9000", "must be in [0.05, 5000], got 9000 (at screen.1.highlight)"),
         ("key.sharpness/=0", "divided by 0"),
         ("key.direction*=2", "set it with ="),

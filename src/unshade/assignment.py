@@ -19,6 +19,8 @@ OPERATIONS: dict[str, Callable[[float, float], float]] = {
     "-=": lambda old, new: old - new,
 }
 
+BRACKETED = re.compile(r"\s*\((.*)\)\s*", re.DOTALL)
+
 FORM = re.compile(r"\s*(?P<where>.+?)\.(?P<parameter>\w+)\s*(?P<operation>[*/+-]?=)\s*(?P<value>.*?)\s*", re.DOTALL)
 
 
@@ -93,8 +95,9 @@ def _sugar(kind: str, parameter: str, text: str, where: str) -> tuple[float, ...
 
 
 def _numbers(text: str, where: str) -> tuple[float, ...]:
+    bracketed = BRACKETED.fullmatch(text)
     try:
-        numbers = tuple(float(part) for part in text.strip("() ").split(","))
+        numbers = tuple(float(part) for part in (bracketed[1] if bracketed else text).split(","))
     except ValueError:
         numbers = (math.nan,)
     if not all(math.isfinite(number) for number in numbers):
