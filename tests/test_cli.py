@@ -269,6 +269,26 @@ def test_json_has_the_promised_keys_and_types(decomposed: list[dict[str, Any]], 
     assert files(tmp_path / "out") == ["ball/tree.json", "results.jsonl"]
 
 
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--second-stage", "size"], "--second-stage is of --method learned; --method search has none"),
+        (["--second-stage", "depth", "--method", "hybrid"], "--method hybrid has none"),
+        (["--weights", "nets"], "this asks no network"),
+    ],
+)
+def test_options_of_networks_that_nobody_asks_are_refused(
+    options: list[str], says: str, decomposed: list[dict[str, Any]], ball: Path, run: Run
+) -> None:
+    told = run("decompose", ball, "--artifacts", "none", *options)
+    assert told.code == 2 and says in told.err and not decomposed
+
+
+def test_weights_are_those_of_reflections_too(decomposed: list[dict[str, Any]], ball: Path, tmp_path: Path, run: Run) -> None:
+    told = run("decompose", ball, "--artifacts", "none", "--weights", tmp_path, "--reflections", "picture")
+    assert told.code == 0 and decomposed[0]["weights"] == str(tmp_path)
+
+
 def test_missing_weights_are_told_before_the_work(
     decomposed: list[dict[str, Any]], ball: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

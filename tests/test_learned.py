@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import torch
 
-from unshade import decoded, inference, learned, search_depth, second_stage, synthesis
+from unshade import batch, decoded, inference, learned, search_depth, second_stage, synthesis
 from unshade.cli import run as run_command
 from unshade.decompose import Result, decompose, fit
 from unshade.errors import MissingWeightsError, TreeError
@@ -99,7 +99,7 @@ def test_a_node_whose_every_sample_is_bad_is_left_over(networks: Networks) -> No
     (pool,) = pools(networks, dataclasses.replace(SETTINGS, stop=-1.0))[-1].pools
     (root,) = pool.parts
     assert root.state == "left over" and root.terms is not None and root.terms.select > -1.0
-    assert pool.left_over == [0]
+    assert pool.left_over == [0] and root.cause == "loss"
 
 
 def endless(networks: Networks) -> Networks:
@@ -115,6 +115,20 @@ def endless(networks: Networks) -> Networks:
 def test_a_pool_has_a_largest_size(networks: Networks) -> None:
     (pool,) = pools(endless(networks), dataclasses.replace(SETTINGS, depth=9, nodes=5))[-1].pools
     assert [part.state for part in pool.parts].count("split") == 5 and len(pool.left_over) == 6
+    assert {pool.parts[place].cause for place in pool.left_over} == {"nodes"}
+    (least,) = pools(endless(networks), dataclasses.replace(SETTINGS, depth=9, nodes=0))[-1].pools
+    assert [part.state for part in least.parts] == ["split", "left over", "left over"], "the root alone is always drawn for"
+
+
+def test_what_is_left_over_says_why(networks: Networks) -> None:
+    (deep,) = pools(endless(networks), dataclasses.replace(SETTINGS, depth=1))[-1].pools
+    (drawn,) = pools(endless(networks), dataclasses.replace(SETTINGS, depth=9, draws=1))[-1].pools
+    for pool, cause in ((deep, "depth"), (drawn, "draws")):
+        assert pool.left_over == [1, 2] and {part.cause for part in pool.parts} == {None, cause}
+        stages = learned.Stages("learned")
+        stages.chosen(pool)
+        assert stages.left_over == {"loss": 0, "depth": 0, "nodes": 0, "draws": 0, cause: 2} and stages.second_stage_nodes == 2
+        assert stages.nodes == 3 and stages.as_dict()["left_over"] == stages.left_over
 
 
 @pytest.mark.parametrize(("trees", "draws"), [(1, 4), (3, 7), (2, 1)])
@@ -340,6 +354,7 @@ def test_the_ablation_takes_parts_away(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     assert none.psnr < plain.psnr < whole.psnr
     assert none.tree.leaves == 1 and none.stages is not None and none.stages["second_stage_share"] == 1.0
+    assert none.stages["second_stage"] == "none" and none.stages["left_over"] == {"loss": 1, "depth": 0, "nodes": 0, "draws": 0}
 
 
 def test_undoing_the_operators_gives_what_a_node_shows() -> None:
@@ -395,7 +410,14 @@ def test_looking_at_a_node_in_its_place_mends_what_was_decoded_badly(monkeypatch
 def test_a_hybrid_stops_where_a_proposal_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
     found = decomposed(SIMPLE, monkeypatch, method="hybrid")
     assert found.psnr > 50.0 and same_structure(found.tree, Tree(SIMPLE))
-    assert found.stages is not None and found.stages["method"] == "hybrid"
+    assert found.stages is not None and found.stages["method"] == "hybrid" and found.stages["tree_of"] == "networks"
+
+
+def test_a_hybrid_that_was_proposed_nothing_says_that_the_tree_is_the_searchs(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = learned.Settings(Inference(samples=1, stop=-1.0))
+    found = decomposed(SIMPLE, monkeypatch, method="hybrid", preset="draft", settings=nothing)
+    assert found.stages is not None and found.stages["tree_of"] == "search"
+    assert batch.stages_words(found.stages) == "the search's own tree; the networks found nothing"
 
 
 DRAFT: dict[str, Any] = {"preset": "draft", "settings": learned.Settings(SETTINGS)}
@@ -471,17 +493,52 @@ def test_arguments_that_do_not_fit(options: dict[str, Any], message: str) -> Non
 
 def test_the_command_reports_the_stages(tiny: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     write_picture(tmp_path / "ball.png", picture(SIMPLE), disc_mask(96).float())
-    words = ["decompose", str(tmp_path / "ball.png"), "--preset", "draft", "--artifacts", "tree", "--json", "-o", str(tmp_path / "out")]
-    assert run_command([*words, "--method", "learned", "--weights", str(tiny), "--second-stage", "none"]) == 0
-    first = json.loads(capfd.readouterr().out)
+    words = ["decompose", str(tmp_path / "ball.png"), "--preset", "draft", "--json", "-o", str(tmp_path / "out"), "--method"]
+    assert run_command([*words, "learned", "--weights", str(tiny), "--second-stage", "none"]) == 0
+    out, err = capfd.readouterr()
+    first = json.loads(out)
     assert first["stages"]["method"] == "learned" and set(first["stages"]["seconds"]) >= {"first stage", "leaves"}
+    said = batch.stages_words(first["stages"])
+    assert said.startswith("left over") and f"{said}\n" in err
+    page = (tmp_path / "out" / "ball" / "report.html").read_text(encoding="utf-8")
+    assert f"{said[0].upper()}{said[1:]}.</p>" in page
     # Done before with the same networks, and not with others.
-    assert run_command([*words, "--method", "learned", "--weights", str(tiny), "--second-stage", "none"]) == 0
-    assert json.loads(capfd.readouterr().out) == first
-    assert run_command([*words, "--method", "learned", "--weights", str(tmp_path)]) == 6
+    assert run_command([*words, "learned", "--weights", str(tiny), "--second-stage", "none"]) == 0
+    out, err = capfd.readouterr()
+    assert json.loads(out) == first and f"{said}\n" in err
+    words += ["learned"]
+    assert run_command([*words, "--weights", str(tmp_path)]) == 6
     assert "no such weights" in capfd.readouterr().err
-    assert run_command([*words, "--method", "hybrid", "--weights", str(tmp_path)]) == 0
+    words[-1] = "hybrid"
+    assert run_command([*words, "--weights", str(tmp_path)]) == 0
     assert "decomposed by search alone" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("stages", "words"),
+    [
+        ({"method": "learned", "second_stage_nodes": 3}, "second stage: 3 of 8 nodes"),
+        ({"method": "learned", "second_stage_nodes": 0, "second_stage": "depth"}, "second stage: 0 of 8 nodes"),
+        ({"method": "learned", "second_stage_nodes": 8}, "second stage: the whole picture, the networks found nothing"),
+        ({"method": "learned", "second_stage_nodes": 3, "second_stage": "none"}, "left over: 3 of 8 nodes, one colour each"),
+        (
+            {"method": "learned", "second_stage_nodes": 8, "second_stage": "none"},
+            "left over: the whole picture, the networks found nothing",
+        ),
+        (
+            {"method": "hybrid", "second_stage_nodes": 3, "tree_of": "networks"},
+            "networks proposed the tree, 5 of 8 nodes; the search finished it",
+        ),
+        (
+            {"method": "hybrid", "second_stage_nodes": 3, "tree_of": "search"},
+            "the search's own tree; those that networks proposed are not better",
+        ),
+        ({"method": "search", "second_stage_nodes": 0, "why": "none"}, "decomposed by search alone, since none"),
+    ],
+)
+def test_who_made_a_tree_in_words(stages: dict[str, Any], words: str) -> None:
+    assert batch.stages_words({"why": "", "nodes": 8} | stages) == words
+    assert batch.stages_words(None) == ""
 
 
 @pytest.mark.skipif(not weights.available(), reason="no weights ship with this checkout")

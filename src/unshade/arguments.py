@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from unshade.errors import TreeError
 from unshade.staging import TREE_FILE
@@ -35,14 +37,47 @@ class Disc(click.ParamType):
         raise click.BadParameter(f"expected three numbers cx,cy,r in pixels such as 128,128,100, got {value!r}", ctx, param)
 
 
-reflections_option = click.option(
-    "--reflections",
-    type=click.Choice(["lights", "picture"]),
-    default="lights",
-    show_default=True,
-    help="Hold a reflected environment as lights, a few values each, or as a picture of 24,576 values, where an image shows one.",
-)
-"""Of `decompose`."""
+def network_options(function: Any) -> Any:
+    """What `decompose` asks networks for; see `check_networks`."""
+    for option in (
+        click.option("--weights", type=click.Path(path_type=str), metavar="DIR", help="Networks of `unshade train`, not those that ship."),
+        click.option(
+            "--reflections",
+            type=click.Choice(["lights", "picture"]),
+            default="lights",
+            show_default=True,
+            help="Hold a reflected environment as lights, a few values each, or as a picture of 24,576 values, where an image shows one.",
+        ),
+        click.option(
+            "--second-stage",
+            type=click.Choice(["size", "depth", "none"]),
+            default="size",
+            show_default=True,
+            help="Of --method learned, for nodes that the networks cannot decompose: our search, the paper's (minutes), or none.",
+        ),
+        click.option(
+            "--method",
+            type=click.Choice(["search", "learned", "hybrid"]),
+            default="search",
+            show_default=True,
+            help="Who proposes structures: the search, networks alone as in the paper, or networks whose trees the search finishes.",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def check_networks(options: Mapping[str, Any]) -> None:
+    """Refuse what would have no effect, among the options of the command that runs. Raises UsageError."""
+
+    def given(name: str) -> bool:
+        return click.get_current_context().get_parameter_source(name) is ParameterSource.COMMANDLINE
+
+    method = options.get("method", "search")
+    if method != "learned" and given("second_stage"):
+        raise click.UsageError(f"--second-stage is of --method learned; --method {method} has none")
+    if method == "search" and given("weights") and options["reflections"] != "picture":
+        raise click.UsageError("--weights are of --method learned or hybrid, or of --reflections picture; this asks no network")
 
 
 def output_options(function: Any) -> Any:

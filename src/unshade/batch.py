@@ -272,11 +272,31 @@ def _written(job: Job, result: Result, sphere: SphereImage, begin: float) -> Rec
 
     shown = artifacts.figures(result, sphere, job.settings.perceptual)
     shown["seconds"] = round(time.perf_counter() - begin, 3)
+    shown["stages"] = stages_words(result.stages)
     tree = artifacts.write(result, sphere, job.folder, job.settings.artifacts, job.picture.name, shown) if job.folder else None
     shown["seconds"] = round(time.perf_counter() - begin, 3)
     record = {"input": str(job.picture), "tree": str(tree) if tree else None, **shown}
     record = {key: record[key] for key in RECORD_KEYS}
     return record | {"stages": result.stages} if result.stages else record
+
+
+def stages_words(stages: Record | None) -> str:
+    """Who made a tree, of `learned.Stages` as a dictionary; nothing where no network was asked."""
+    if not stages:
+        return ""
+    if stages["why"]:
+        return f"decomposed by {stages['method']} alone, since {stages['why']}"
+    nodes, left = stages["nodes"], stages["second_stage_nodes"]
+    found = left < nodes
+    if stages["method"] == "hybrid":
+        if stages.get("tree_of") == "networks":
+            return f"networks proposed the tree, {nodes - left} of {nodes} nodes; the search finished it"
+        return "the search's own tree; " + ("those that networks proposed are not better" if found else "the networks found nothing")
+    if stages.get("second_stage") == "none":
+        return (
+            f"left over: {left} of {nodes} nodes, one colour each" if found else "left over: the whole picture, the networks found nothing"
+        )
+    return f"second stage: {left} of {nodes} nodes" if found else "second stage: the whole picture, the networks found nothing"
 
 
 def failure(picture: Path, message: str, exit_code: int) -> Record:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from unshade import __version__, batch, cli_extract, cli_verbs
-from unshade.arguments import SEED, output_options, read_document, read_tree, reflections_option
+from unshade.arguments import SEED, check_networks, network_options, output_options, read_document, read_tree
 from unshade.errors import TreeError, UnshadeError
 from unshade.staging import check_folder
 
@@ -120,22 +120,7 @@ def cli(context: click.Context) -> None:
     show_default=True,
     help="Of the search by depth: pixels alone, or the paper's L2 plus VGG features, a hundred times slower; needs the perceptual extra.",
 )
-@click.option(
-    "--method",
-    type=click.Choice(["search", "learned", "hybrid"]),
-    default="search",
-    show_default=True,
-    help="Who proposes structures: the search, networks alone as in the paper, or networks whose trees the search finishes.",
-)
-@click.option(
-    "--second-stage",
-    type=click.Choice(["size", "depth", "none"]),
-    default="size",
-    show_default=True,
-    help="Of --method learned, for nodes that the networks cannot decompose: our search, the paper's (minutes), or none.",
-)
-@reflections_option
-@click.option("--weights", type=click.Path(path_type=str), metavar="DIR", help="Networks of `unshade train`, not those that ship.")
+@network_options
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes for several pictures; all cores when not given.")
 @click.option("--resume/--force", default=True, help="Skip pictures that are done with the same settings (the default), or do them again.")
 @output_options
@@ -158,7 +143,7 @@ def decompose(
     With --json every picture is one line with the keys input, tree (path), psnr, ssim, st_lpips (null without
     --perceptual), values, leaves, seconds and seed; a picture that failed has input, error and exit_code. With --method
     learned or hybrid it also has stages: the nodes that the networks decomposed, the share that reached the second
-    stage, and what each stage took.
+    stage and why, and what each stage took; a line for a person and the page say it in words.
 
     \b
     Examples:
@@ -200,6 +185,7 @@ def decompose(
 
 def _settings(output: Path | None, options: dict[str, Any]) -> tuple[batch.Settings, Path | None]:
     """The settings, and the folder to write into unless nothing is to be written. Raises UsageError, OutputError."""
+    check_networks(options)
     settings = batch.Settings(**options)
     if settings.artifacts == "none":
         return settings, None
@@ -219,8 +205,8 @@ def _tell(record: batch.Record, messages: Messages, before: str = "") -> None:
         folder = Path(record["tree"]).parent if record["tree"] else None
         page = folder / "report.html" if folder else None
         where = f"  {page if page and page.exists() else folder}" if folder else ""
-        if why := record.get("stages", {}).get("why"):
-            messages.say(f"{record['input']}: decomposed by {record['stages']['method']} alone, since {why}")
+        if said := batch.stages_words(record.get("stages")):
+            messages.say(f"{record['input']}: {said}", "dim" if before else "")
         messages.say(f"{record['input']}: {before}{figures_line(record)}{where}", "dim" if before else "")
 
 

@@ -84,6 +84,10 @@ class Inference:
     """Decompositions of a node that pools may differ in."""
 
 
+Cause = Literal["loss", "depth", "nodes", "draws"]
+"""Why a node is left over: its best sample is over tau, or it would be one more than `Inference` allows of levels, nodes or draws."""
+
+
 @dataclass(frozen=True)
 class Networks:
     """The trained networks, all of one size and one codebook, in evaluation mode."""
@@ -156,6 +160,8 @@ class Part:
     """Places in the pool, of a part that is split."""
     mask: Mask | None = None
     """(1, S, S), of a mix."""
+    cause: Cause | None = None
+    """Of a part that is left over."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,10 +268,10 @@ def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> I
         parts = list({id(pool.parts[place]): pool.parts[place] for pool in pools for place in pool.open}.values())
         parts = parts[: settings.draws - drawn]
         if not parts:
-            yield Round(tuple(_left_over(pool, pool.open) for pool in pools), drawn)
+            yield Round(tuple(_left_over(pool, pool.open, "draws") for pool in pools), drawn)
             return
         chosen = {id(part) for part in parts}
-        pools = tuple(_left_over(pool, [place for place in pool.open if id(pool.parts[place]) not in chosen]) for pool in pools)
+        pools = tuple(_left_over(pool, [place for place in pool.open if id(pool.parts[place]) not in chosen], "draws") for pool in pools)
         with torch.no_grad():
             found = _splits(parts, networks, settings, generator)
         splits = {id(part): ways for part, ways in zip(parts, found, strict=True)}
@@ -278,15 +284,17 @@ def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> I
 
 def _limited(pool: Pool, most: int) -> Pool:
     """The pool with open parts left over that are too many."""
-    return _left_over(pool, pool.open[most - sum(part.state == "split" for part in pool.parts) :])
+    room = most - sum(part.state == "split" for part in pool.parts)
+    return _left_over(pool, pool.open[max(room, 0) :], "nodes")
 
 
-def _left_over(pool: Pool, places: Sequence[int]) -> Pool:
+def _left_over(pool: Pool, places: Sequence[int], cause: Cause) -> Pool:
     """The pool with some parts left over."""
     over = set(places)
     if not over:
         return pool
-    return Pool(tuple(dataclasses.replace(part, state="left over") if k in over else part for k, part in enumerate(pool.parts)))
+    parts = (dataclasses.replace(part, state="left over", cause=cause) if k in over else part for k, part in enumerate(pool.parts))
+    return Pool(tuple(parts))
 
 
 def _splits(parts: Sequence[Part], networks: Networks, settings: Inference, generator: torch.Generator) -> list[list[_Split]]:
@@ -320,10 +328,8 @@ def _splits(parts: Sequence[Part], networks: Networks, settings: Inference, gene
 
 
 def _child(image: Image, codes: Codes, kind: str, depth: int, settings: Inference) -> Part:
-    state: Literal["open", "leaf", "left over"] = "leaf"
-    if kind == "operator":
-        state = "open" if depth < settings.depth else "left over"
-    return Part(image, codes, kind, state, depth)
+    part = Part(image, codes, kind, "open" if kind == "operator" else "leaf", depth)
+    return dataclasses.replace(part, state="left over", cause="depth") if part.state == "open" and depth >= settings.depth else part
 
 
 def criterion(
@@ -375,7 +381,7 @@ def _split(pool: Pool, ways: dict[int, _Split], stop: float) -> Pool:
     parts = list(pool.parts)
     for place, way in ways.items():
         if way.terms.select > stop:
-            parts[place] = dataclasses.replace(parts[place], state="left over", terms=way.terms)
+            parts[place] = dataclasses.replace(parts[place], state="left over", terms=way.terms, cause="loss")
             continue
         parts[place] = dataclasses.replace(
             parts[place], state="split", terms=way.terms, operator=way.operator, mask=way.mask, children=(len(parts), len(parts) + 1)

@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 
@@ -27,7 +27,7 @@ from unshade.fit.least_squares import FINE_SOFTNESS, error_of, fit_pixels
 from unshade.fit.model import soften
 from unshade.fit.pixels import Pixels
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
-from unshade.inference import Inference, Networks, Pool, Round, infer, node_image
+from unshade.inference import Cause, Inference, Networks, Pool, Round, infer, node_image
 from unshade.nodes import Node, count_values
 from unshade.proposals import Fits
 from unshade.search import Search
@@ -83,11 +83,17 @@ class Stages:
     """That was used."""
     why: str = ""
     """Where it is not the one that was asked for."""
+    second_stage: SecondStageName | None = None
+    """Of the learned method."""
+    tree_of: Literal["networks", "search"] | None = None
+    """Of the hybrid: whose tree became the result, one that networks proposed or the search's own."""
     rounds: int = 0
     nodes: int = 0
     """Of the chosen tree that were to be decomposed."""
     second_stage_nodes: int = 0
-    """Of them, those that the networks could not decompose."""
+    """Of them, those that the networks could not decompose. All of them are one, the picture itself, where the networks found nothing."""
+    left_over: dict[Cause, int] = field(default_factory=lambda: dict.fromkeys(get_args(Cause), 0))
+    """The same by why."""
     drawn_nodes: int = 0
     """That children were drawn for, over all trees."""
     samples: int = 0
@@ -103,6 +109,8 @@ class Stages:
 
     def chosen(self, pool: Pool) -> None:
         """Count the nodes of the pool that became the tree."""
+        causes = [pool.parts[place].cause for place in pool.left_over]
+        self.left_over = {cause: causes.count(cause) for cause in self.left_over}
         self.second_stage_nodes = len(pool.left_over)
         self.nodes = self.second_stage_nodes + sum(part.state == "split" for part in pool.parts)
 
@@ -160,7 +168,7 @@ class Learned(Growth):
     ) -> None:
         super().__init__(samples, effort)
         self.settings = settings
-        self.stages = Stages("learned")
+        self.stages = Stages("learned", second_stage=settings.second_stage)
         self.proposing = _Proposing(image, valid, networks, settings, seed, self.stages)
         fits = self.proposing.fits
         self.second = (
@@ -198,7 +206,8 @@ class Learned(Growth):
             with self.stages.clock("second stage"):
                 second[place] = self.second.decompose(pool, place, second)
             yield self._rough(self.proposing.tree(pool, second))
-        if not self.settings.in_place or not any(second):
+        # A pool whose root is left over has no other parts, and the root is in its place already.
+        if not self.settings.in_place or not [place for place in second if place]:
             return
         best = self._placed(pool, second)
         for place in pool.left_over:
@@ -264,13 +273,12 @@ class Hybrid(Search):
             best = min([best, *(candidate for candidate, _ in trees)], key=lambda candidate: candidate.error)
             yield "propose", best
         survivors = sorted(trees, key=lambda entry: self.judged(entry[0]))[:SURVIVORS]
-        self.stages.chosen(survivors[0][1])
         finished: list[Candidate] = []
         for proposed, pool in survivors:
             with self.stages.clock("proposals"):
                 finished.append(self._settled(proposed))
             if finished[-1].error < DRAWN:
-                self.stages.chosen(pool)
+                self._decided("networks", pool)
                 yield "propose", finished[-1]
                 return
         results = []
@@ -283,7 +291,16 @@ class Hybrid(Search):
             for _ in range(self.effort.sweeps):
                 current = self._sweep(current, self.samples.points)
             results.append(self.sharpen(current))
-        yield "polish", min(results, key=self.judged)
+        best = min(results, key=self.judged)
+        place = next(place for place, result in enumerate(results) if result is best)
+        self._decided("networks" if place else "search", survivors[max(place - 1, 0)][1])
+        yield "polish", best
+
+    def _decided(self, whose: Literal["networks", "search"], pool: Pool) -> None:
+        """Note whose tree is the result, and count the nodes of the proposal that it is, or of the best one."""
+        self.stages.chosen(pool)
+        # What grows from a proposal of one colour is the search's.
+        self.stages.tree_of = whose if self.stages.second_stage_nodes < self.stages.nodes else "search"
 
     def _proposed(self, pool: Pool) -> Candidate:
         """The tree of a pool, fitted to the coarse averages."""

@@ -67,6 +67,7 @@ def report_html(result: Result, sphere: SphereImage, source_name: str, figures: 
         sphere: the picture that was decomposed.
         source_name: what to call the picture.
         figures: any of ``psnr``, ``ssim``, ``st_lpips``, ``values``, ``leaves``, ``seconds``, ``seed`` and ``preset``; None is left out.
+            ``stages`` is a sentence: who made the tree.
     """
     family = result.family
     image = sphere.image.detach().float().cpu()
@@ -81,6 +82,7 @@ def report_html(result: Result, sphere: SphereImage, source_name: str, figures: 
     members = dict(zip([*keys, *others], [*family.members, *family.alternatives], strict=True))
     members[chosen] = Member(result.tree, result.psnr)
     shown = {"seed": result.seed, "preset": result.preset, **figures}
+    stages = shown.pop("stages", "")
     sheets = {chosen: _sheet(chosen, members[chosen], picture, "The chosen tree", shown, fine=True)}
     template = (resources.files("unshade") / "report_template.html").read_text(encoding="utf-8")
     stored = base64.b64encode(dumps(family).encode()).decode()
@@ -98,6 +100,7 @@ def report_html(result: Result, sphere: SphereImage, source_name: str, figures: 
         template,
         {
             "title": escape(source_name),
+            "stages": f'<p class="quiet stages">{escape(stages[0].upper() + stages[1:])}.</p>' if stages else "",
             "tree_style": STYLE,
             "chosen": chosen,
             "input": shown_input,

@@ -169,3 +169,9 @@ def stored_alpha(data: bytes) -> torch.Tensor:
 def test_leaves_in_the_stand_in_are_what_they_should_be(made: SimpleNamespace) -> None:
     kinds = {node.kind for _, node in made.everything().walk() if isinstance(node, Leaf)}
     assert {"environment", "environment_map", "image", "stripe", "toon_diffuse", "rim", "albedo"} <= kinds
+
+
+def test_the_page_says_who_made_the_tree(made: SimpleNamespace) -> None:
+    said = "second stage: <3 of 8> nodes"
+    assert '<p class="quiet stages">Second stage: &lt;3 of 8&gt; nodes.</p>' in made.page(made.balanced(), stages=said)
+    assert 'class="quiet stages"' not in made.balanced_page() and 'class="quiet stages"' not in made.page(made.balanced(), stages="")
