@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -17,9 +18,9 @@ from unshade.cli import run as run_command
 from unshade.components import Component
 from unshade.decompose import Result, decompose
 from unshade.edit import transfer
-from unshade.environments import raster
+from unshade.environments import blurred, raster
 from unshade.errors import MissingWeightsError, TreeError, UnshadeError
-from unshade.experiments import methods
+from unshade.experiments import methods, subjects
 from unshade.grammar import same_structure
 from unshade.models import weights
 from unshade.models.config import find
@@ -31,6 +32,8 @@ from unshade.render import render
 from unshade.separation import Separation
 from unshade.serde import parse
 from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
+from unshade.synthesis import trees
+from unshade.threads import threads
 from unshade.types import Image
 
 DISC, SCORED = disc_mask(256), disc_mask(256, SCORED_RADIUS)
@@ -88,6 +91,74 @@ def test_edges_of_masks_are_found_beneath_a_reflection(masks: tuple[str, ...]) -
         assert min(min(float((true != one).float().mean()), float((true == one).float().mean())) for one in pictures) < 0.004
 
 
+def pair(first: str, second: str) -> Node:
+    """Two paints across a third, a photograph on top."""
+    masks = [parse(f"mix(albedo(#fff), albedo(#000), {mask})").root.mask for mask in (first, second)]  # type: ignore[union-attr]
+    one, two, three = (leaf("albedo", color=color) for color in ((0.7, 0.3, 0.2), (0.2, 0.4, 0.6), (0.6, 0.6, 0.1)))
+    assert masks[0] is not None and masks[1] is not None
+    paint = mix(mix(one, two, masks[0]), three, masks[1])
+    return screen(multiply(paint, leaf("diffuse", direction=(-0.5, 0.5, 0.7), ambient=0.4)), COAT)
+
+
+def masks_right(picture: Image, *wanted: str) -> bool:
+    """Are just these found?"""
+    masks = [parse(f"mix(albedo(#fff), albedo(#000), {text})").root.mask for text in wanted]  # type: ignore[union-attr]
+    inside = disc_mask(256, SCORED_RADIUS)[0]
+    true = [(render(mask, NORMALS)[0] > 0.5)[inside] for mask in masks if mask is not None]
+    ours = [(render(mask, NORMALS)[0] > 0.5)[inside] for mask in edge_masks(picture, disc_mask(picture.shape[-1]))]
+
+    def near(a: torch.Tensor, b: torch.Tensor) -> bool:
+        return min(float((a != b).float().mean()), float((a == b).float().mean())) < 1.5 / picture.shape[-1]
+
+    return len(ours) == len(true) and all(any(near(one, mask) for one in ours) for mask in true)
+
+
+def test_two_stripes_across_each_other() -> None:
+    """Four circles, parallel in pairs; planes of one tilt are not taken for each other."""
+    first, second = "stripe(up front, 0.4, 0.4)", "stripe(left, 0.5, 0.6)"
+    assert masks_right(shown(pair(first, second)), first, second)
+
+
+@pytest.mark.parametrize("size", [128, 512, 1024, "smooth"])
+def test_edges_are_found_at_every_size(size: int | str) -> None:
+    """Also where each pixel is the mean of many, as programs draw."""
+    stripe = "stripe(right up, 0.1, 0.4)"
+    root = under(COAT, f"screen(multiply(mix(albedo(#c04030), albedo(#308040), {stripe}), diffuse(left up front, 0.3)), rim(left))")
+    if isinstance(size, int):
+        picture = render(root, sphere_normals(size))
+    else:
+        picture = torch.nn.functional.avg_pool2d(render(root, sphere_normals(1024)), 4)
+    assert masks_right((picture * 255.0).round() / 255.0, stripe)
+
+
+def test_a_drawing_reflects_nothing() -> None:
+    """The network takes some for photographs; what is left for the environment then still has the drawing's edges."""
+    drawing = shown(list(islice(trees("toon", "test", seed=77), 4))[3])
+    sphere = subjects.known(list(islice(trees("toon", "test", seed=77), 4))[3]).sphere
+    network = reflections.load()
+    assert reflections.beneath(drawing, DISC, network)[1] > reflections.SHOWS
+    assert list(filter(None, reflections.uncover(sphere, leaf("albedo"), network, 0))) == []
+
+
+def test_uncovering_can_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reflections, "panorama", None)
+    work = decompose(shown(under(COAT)), preset="draft", reflections="picture")
+    told = 0
+    for step in work:
+        told += step.stage == "reflections"
+        if told == 3:
+            work.cancel()
+    assert told == 3 and work.result().tree.values <= 30
+
+
+def test_environments_do_not_depend_on_cores() -> None:
+    light = torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(0))
+    with threads(1):
+        once = blurred(light, 60.0)
+    with threads(2):
+        assert torch.equal(blurred(light, 60.0), once)
+
+
 def test_no_edges_where_there_are_none() -> None:
     noise = torch.rand(3, 256, 256, generator=torch.Generator().manual_seed(0))
     assert edge_circles(noise, DISC) == []
@@ -138,10 +209,14 @@ def test_lights_that_do_not_pay_are_left_out() -> None:
 
 
 def test_paint_and_form_are_never_left_out() -> None:
-    base = parse("multiply(albedo(#a06040), diffuse(up, 0.3))").root
-    white = torch.ones(3, 256, 256)
-    separation = Separation(shown(screen(base, COAT)), DISC, white, 0)
-    assert same_structure(Tree(separation.prune(separation.fit(base, 2)).root), Tree(base))
+    """Not even where the light alone would be the cheaper tree."""
+    lit = parse("screen(multiply(albedo(#a06040), diffuse(up, 0.3)), highlight(right front, 60, 1.2))").root
+    separation = Separation(shown(COAT), DISC, torch.zeros(3, 256, 256), 0)
+    current = separation.fit(lit, 2)
+    light = node_at(lit, "screen.1.highlight")
+    assert light is not None and separation.fit(light, 2).cost < current.cost
+    kinds = [node.kind for _, node in walk(separation.prune(current).root)]
+    assert kinds.count("albedo") == 1 and kinds.count("diffuse") == 1
 
 
 def test_a_reflection_is_held_as_a_picture() -> None:
@@ -226,6 +301,14 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         assert json.loads(capsys.readouterr().out)["values"] < 30
     # Done again only where the settings differ.
     assert len((tmp_path / "out" / "results.jsonl").read_text().splitlines()) == 2
+
+
+def test_the_command_holds_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "ball.png"
+    write_picture(picture, shown(under(COAT)), DISC)
+    arguments = ["decompose", str(picture), "-o", str(tmp_path / "out"), "--artifacts", "tree", "--json", "--preset", "draft"]
+    assert run_command([*arguments, "--reflections", "picture"]) == 0
+    assert json.loads(capsys.readouterr().out)["values"] > 24_576
 
 
 def test_experiments_name_it() -> None:

@@ -138,7 +138,8 @@ def decompose(
         weights: folder of the networks; None for those that ship.
         settings: all about the networks' part, instead of ``second_stage`` and the defaults; see `unshade.learned`.
         reflections: how a reflected environment is held: ``lights`` are a few values each; ``picture`` is a raster of 24,576
-            values over a tree of what is beneath (`unshade.reflections`), where a picture shows one; ``max_values`` is of the rest.
+            values over a tree of what is beneath (`unshade.reflections`), where a picture shows one. ``max_values`` is of the tree of
+            lights, which stays in the family; what is beneath has the released grammar's leaves, 37 values at most.
     Raises:
         PictureError: the picture cannot be used. TreeError: an argument is out of range. MissingExtraError: the
             ``paper`` objective without its weights. MissingWeightsError: ``learned`` or ``picture`` without theirs.
@@ -264,8 +265,8 @@ def _without_gradients(work: Iterator[Step | Result]) -> Iterator[Step | Result]
 Begin: TypeAlias = "Callable[[Samples, Effort], Search | Learned | Hybrid]"
 """Starts the main search on a picture's pixels."""
 
-Uncover: TypeAlias = "Callable[[SphereImage, Node], Node | None]"
-"""From a tree of a picture to one with its environment as a raster, if it shows one."""
+Uncover: TypeAlias = "Callable[[SphereImage, Node], Iterator[Node | None]]"
+"""From a tree of a picture to one with its environment as a raster, if it shows one; None after each piece of work."""
 
 HELD = 48.0
 """dB from which on a tree holds a picture, whatever it reflects."""
@@ -335,9 +336,10 @@ def _by_size(
             curve.append(member)
     curve.append(chosen)
     if uncover is not None and chosen.psnr < HELD:
-        yield Step(chosen.tree, chosen.psnr, chosen.values, "reflections", total - 1, total)
-        root = uncover(sphere, chosen.tree.root)
-        mirrored = _member(sphere, root) if root is not None else chosen
+        mirrored = chosen
+        for root in uncover(sphere, chosen.tree.root):
+            yield Step(chosen.tree, chosen.psnr, chosen.values, "reflections", total - 1, total)
+            mirrored = _member(sphere, root) if root is not None else chosen
         if mirrored.psnr > chosen.psnr:
             chosen = mirrored
             curve.append(chosen)

@@ -18,6 +18,7 @@ from safetensors.torch import load_file
 
 from unshade.nodes import Raster
 from unshade.render import srgb_encode
+from unshade.threads import threads
 from unshade.types import Image
 
 FOLDER = Path(__file__).parent / "hdri"
@@ -67,17 +68,21 @@ def raster(split: str, version: int) -> Raster:
 
 
 def blurred(light: Image, sharpness: float) -> Image:
-    """Environments (K, 3, h, w) seen in a rough coat: averaged with weights ``exp(-sharpness * |a - b|^2)`` of directions a and b."""
+    """Environments (K, 3, h, w) seen in a rough coat: averaged with weights ``exp(-sharpness * |a - b|^2)`` of directions a and b.
+
+    On one thread: trees of one seed hold the same bits however many cores there are.
+    """
     height, width = light.shape[-2:]
-    small = F.avg_pool2d(light, height // BLURRED_HEIGHT)
-    toward, areas = directions(BLURRED_HEIGHT)
-    weights = torch.exp(-2.0 * sharpness * (1.0 - toward @ toward.T)) * areas
-    spread = (small.flatten(2) @ (weights / weights.sum(1, keepdim=True)).T).view_as(small)
-    # Wrapped round before it is enlarged, so that no seam shows.
-    wrapped = torch.cat([spread[..., -2:], spread, spread[..., :2]], dim=-1)
-    scale = height // BLURRED_HEIGHT
-    large = F.interpolate(wrapped, scale_factor=scale, mode="bilinear", align_corners=False)
-    return large[..., 2 * scale : 2 * scale + width]
+    with threads(1):
+        small = F.avg_pool2d(light, height // BLURRED_HEIGHT)
+        toward, areas = directions(BLURRED_HEIGHT)
+        weights = torch.exp(-2.0 * sharpness * (1.0 - toward @ toward.T)) * areas
+        spread = (small.flatten(2) @ (weights / weights.sum(1, keepdim=True)).T).view_as(small)
+        # Wrapped round before it is enlarged, so that no seam shows.
+        wrapped = torch.cat([spread[..., -2:], spread, spread[..., :2]], dim=-1)
+        scale = height // BLURRED_HEIGHT
+        large = F.interpolate(wrapped, scale_factor=scale, mode="bilinear", align_corners=False)
+        return large[..., 2 * scale : 2 * scale + width]
 
 
 def directions(height: int) -> tuple[torch.Tensor, torch.Tensor]:

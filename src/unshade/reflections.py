@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import permutations
 from pathlib import Path
 from typing import cast
@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 
 from unshade.atoms import dictionary_of, directions
-from unshade.circles import edge_masks
+from unshade.circles import edge_circles, edge_masks
 from unshade.fit.least_squares import COARSE_SIZE, fit_pixels
 from unshade.fit.pixels import Pixels
 from unshade.growth import Candidate, Effort, Growth, Samples
@@ -31,7 +31,7 @@ from unshade.nodes import KINDS, Leaf, Node, Operator, Raster, leaf, walk
 from unshade.pictures import SphereImage
 from unshade.pixel_sets import grain
 from unshade.render import render
-from unshade.separation import LIMITS, Separation
+from unshade.separation import LIMITS, SIDES, Separation
 from unshade.sphere import disc_mask, sphere_normals
 from unshade.types import Image, Mask
 
@@ -41,8 +41,12 @@ SHOWS = 0.03
 GRAIN = 6.0
 """Most grain of a picture (`pixel_sets.grain`): a sharp reflection has up to 5, a noisy photograph more."""
 
-PLACES = 200
+KNOWN = 200
 """Least pixels that are known and not white."""
+
+DRAWN, BRIGHT = 1.5, 0.3
+"""Length of the circles, in sides of the picture, that still end something in what is left for an environment, from which on it is a
+drawing; and the brightness that the network never takes a drawing's environment for."""
 
 HEIGHT = 64
 """Rows of the environment's picture."""
@@ -58,9 +62,6 @@ HIDDEN = 0.02
 
 AMBIENT = 0.35
 """Of a form before it is fitted, the middle of the released grammar's."""
-
-FORMS = 24
-"""Directions that a form starts from."""
 
 CLOSE = 1e-4
 """Mean squared error at which what the network takes for the picture beneath is explained."""
@@ -99,30 +100,46 @@ def beneath(image: Image, valid: Mask, network: ReflectionNet) -> tuple[Image, f
     return F.interpolate(plain, size=image.shape[-1], mode="bilinear")[0].clamp(0.0, 1.0), share
 
 
-def uncover(sphere: SphereImage, found: Node, network: ReflectionNet, seed: int) -> Node | None:
-    """A tree of a picture with its environment as a raster, on top of all; None where it reflects none, or is too white or
-    has too much grain to tell.
+def uncover(sphere: SphereImage, found: Node, network: ReflectionNet, seed: int) -> Iterator[Node | None]:
+    """Work on a tree of a picture with its environment as a raster, on top of all; about ten seconds of one core.
 
     Args:
         found: a tree of the picture, whose lights are tried.
+
+    Yields:
+        None after each piece of work, then the tree. It stays at None where the picture reflects no environment, is a drawing, is too
+        white or has too much grain to tell (which pictures of less than about 64 pixels seem to have: their shading is as rough).
     """
     image, valid = sphere.image, sphere.valid
+    if grain(image, valid) > GRAIN:
+        return
     plain, share = beneath(image, valid, network)
-    if share < SHOWS or grain(image, valid) > GRAIN:
-        return None
     separation = Separation(image, valid, plain, seed)
-    if separation.pixels.count < PLACES:
-        return None
+    if share < SHOWS or separation.pixels.count < KNOWN:
+        return
+    yield None
     pixels = Pixels.of(plain, valid, COARSE_SIZE)
-    starts = (separation.fit(root, 8) for root in _starts(pixels, edge_masks(image, valid, seed)[:2]))
+    starts = []
+    for root in _starts(pixels, edge_masks(image, valid, seed)):
+        starts.append(separation.fit(root, 8))
+        yield None
     current = separation.fit(min(starts, key=lambda separated: separated.cost).root, 25)
-    current = separation.turn(separation.prune(current))
-    current = separation.turn(separation.prune(separation.grow(current, list(_lights(found)))))
+    for improve in (
+        separation.prune,
+        separation.turn,
+        partial(separation.grow, known=list(_lights(found))),
+        separation.prune,
+        separation.turn,
+    ):
+        current = improve(current)
+        yield None
     root = separation.fit(current.root, 40, 1e-6).root
     under = render(root, sphere_normals(sphere.size))
     seen = (1.0 - (1.0 - image) / (1.0 - under).clamp(min=HIDDEN)).clamp(0.0, 1.0)
+    if share < BRIGHT and sum(len(circle.places) for circle in edge_circles(seen, valid, seed)) > DRAWN * sphere.size:
+        return
     environment = panorama(seen, (1.0 - under).square() * valid)
-    return add_light(root, leaf("environment_map", pixels=Raster.from_array(environment)))
+    yield add_light(root, leaf("environment_map", pixels=Raster.from_array(environment)))
 
 
 def panorama(reflection: Image, weight: Image, height: int = HEIGHT) -> Image:
@@ -168,21 +185,19 @@ def _bent(panorama: Image) -> Image:
     return inner - around[:, 1:-1, 2:] - around[:, 1:-1, :-2] - around[:, 2:, 1:-1] - around[:, :-2, 1:-1]
 
 
-def _starts(pixels: Pixels, masks: list[Leaf]) -> list[Node]:
+def _starts(pixels: Pixels, masks: list[Leaf]) -> Iterator[Node]:
     """Trees of what the network takes for the picture beneath, one of each way to paint it with these masks."""
     dictionary = dictionary_of(pixels)
     growth = Growth(Samples(pixels, pixels, pixels, dictionary, dictionary), LIGHTS)
-    found = []
     for paint in _paints(masks):
         bare = _formed(pixels, paint)
         *_, lit = [bare, *growth.grow(bare, pixels, dictionary, CLOSE, ("plain_lights", "plain_rims"), LIMITS)]
-        found.append(lit.root)
-    return found
+        yield lit.root
 
 
 def _paints(masks: list[Leaf]) -> Iterator[Node]:
-    """Every way to mix colours by no more than two masks."""
-    color = leaf("albedo", color=(0.5, 0.5, 0.5))
+    """Every way to mix colours by the first two masks."""
+    color, masks = leaf("albedo", color=(0.5, 0.5, 0.5)), masks[:2]
     if not masks:
         yield color
     if len(masks) == 1:
@@ -196,7 +211,7 @@ def _paints(masks: list[Leaf]) -> Iterator[Node]:
 def _formed(pixels: Pixels, paint: Node) -> Candidate:
     """The paint under a light, from its best direction."""
     options = []
-    for direction in directions(FORMS, -0.1).tolist():
+    for direction in directions(SIDES, -0.1).tolist():
         root = Operator("multiply", (paint, leaf("diffuse", direction=direction, ambient=AMBIENT)))
         options.append(fit_pixels(pixels, root, steps=3, limits=LIMITS))
     best = fit_pixels(pixels, min(options, key=lambda option: option.error).root, steps=15, limits=LIMITS)

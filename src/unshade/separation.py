@@ -51,7 +51,7 @@ NOISE = 1.2e-3
 """Deviation of a pixel that is rounded to 8 bits."""
 
 NEGATIVE = 3.0e-3
-"""Square of the log(1 - E) over 0 that costs as much as one bend."""
+"""Square of a log(1 - E) over 0 that counts as much as a residual of one deviation."""
 
 TIE, TIE_WIDTH = 0.3, 0.08
 """Weight of the network's picture beside the bends, and the error that it is expected to have."""
@@ -60,7 +60,7 @@ PRICE = 60.0
 """What a stored value must save, in bends."""
 
 EXCESS = 2000.0
-"""What a light costs that the released grammar has not."""
+"""What a light more than the released grammar has must save, in the same."""
 
 SIDES = 24
 """Directions that a form is tried from."""
@@ -183,9 +183,10 @@ class Separation:
 
     def turn(self, current: Separated) -> Separated:
         """The tree with its form from another side, where that pays."""
-        address = next(where for where, node in walk(current.root) if node.kind == "diffuse")
-        form = find(current.root, address)
-        assert isinstance(form, Leaf)
+        address = next((where for where, node in walk(current.root) if node.kind == "diffuse"), None)
+        form = find(current.root, address) if address is not None else None
+        if address is None or not isinstance(form, Leaf):
+            return current
         turned = (replace(current.root, address, form.set(direction=side)) for side in directions(SIDES, -0.1).tolist())
         quick = sorted((self.fit(root, 3) for root in turned), key=_cost)
         return min([current, *(self.fit(option.root, 15) for option in quick[:2])], key=_cost)

@@ -2,7 +2,8 @@
 
 - ``cnn``, ``lstm``, ``transformer``: the baselines; with ``+fit`` our fit of the whole tree goes over what they found.
 - ``learned``: the paper's method; ``learned:base``, ``learned:samples``, ``learned:second``, ``learned:overall`` and
-  ``learned`` itself (or ``learned:full``) are its ablation; ``learned:alone`` has no second stage, ``learned:depth`` the paper's own, minutes a picture.
+  ``learned`` itself (``learned:full`` is the same) are its ablation; ``learned:alone`` has no second stage, ``learned:depth``
+  the paper's own, minutes a picture.
 - ``search:PRESET``, ``hybrid:PRESET``: ours; with ``+reflections`` a reflected environment is held as a picture.
 """
 
