@@ -5,6 +5,10 @@ from __future__ import annotations
 import functools
 import json
 import os
+import signal
+import subprocess
+import sys
+import threading
 import time
 from pathlib import Path
 
@@ -143,6 +147,33 @@ def test_a_process_that_dies_costs_only_its_own_job() -> None:
     found = dict(crew.run(jobs, 2, exec, lost, abandoned.append))
     assert found == {jobs[0]: f"{jobs[0]} lost with 7", "1": None, "2": None, "3": None}
     assert abandoned == [jobs[0]]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows blocks no signals")
+@pytest.mark.parametrize("threads", [0, 1], ids=["alone", "beside a thread that may be sent the signal"])
+def test_an_interrupt_waits_until_a_process_has_started(threads: int) -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    over = threading.Event()
+    for _ in range(threads):
+        threading.Thread(target=over.wait, daemon=True).start()
+    asked = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
+    told = []
+    try:
+        with pytest.raises(KeyboardInterrupt), crew._uninterrupted():
+            os.kill(os.getpid(), signal.SIGINT)
+            told.append(subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True).stdout.strip())
+        assert told == ["True"], "the work went on, and the process that it started knows no interrupt"
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    finally:
+        over.set()
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
+def test_workers_leave_interrupts_to_the_parent() -> None:
+    jobs = [f"import os, signal; os.kill(os.getpid(), signal.SIGINT); {k}" for k in range(3)]
+    assert dict(crew.run(jobs, 2, exec, lost, lambda job: None)) == dict.fromkeys(jobs)
 
 
 def test_closing_ends_the_workers_and_cleans_up() -> None:

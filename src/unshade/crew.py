@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
+from multiprocessing import resource_tracker
 from typing import Any, Generic, TypeVar
 
 Job = TypeVar("Job")
@@ -111,6 +112,8 @@ class _Worker(Generic[Job, Answer]):
 def _serve(pipe: multiprocessing.connection.Connection[Any, Any], work: Callable[[Any], Any]) -> None:
     """A worker's life: jobs in, answers out, until the pipe closes. Ctrl-C is for the parent to handle."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform != "win32":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     with contextlib.suppress(EOFError, OSError):
         while True:
             pipe.send(work(pipe.recv()))
@@ -118,12 +121,23 @@ def _serve(pipe: multiprocessing.connection.Connection[Any, Any], work: Callable
 
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Processes started in here ignore Ctrl-C from their first moment on, before they can say so themselves."""
+    """Processes started in here know no Ctrl-C from their first moment on, before they can say so themselves.
+
+    Here it waits: one that comes in the meantime interrupts at the end, when the new process has all that it needs.
+    """
     if threading.current_thread() is not threading.main_thread() or sys.platform == "win32":
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # This process's helper lets signals through when it starts, so it starts first.
+    resource_tracker.ensure_running()
+    came: list[int] = []
+    # Children inherit what is blocked. A thread that does not block it, such as a progress bar's, may still be sent it.
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         signal.signal(signal.SIGINT, before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
