@@ -64,9 +64,10 @@ class Context:
 
     def cases(self, dataset: str, usual: int) -> list[Case]:
         """Of a set; an absent one is noted."""
-        found = find_cases(dataset, self.options.data or default_data(), self.options.count(usual))
+        data = self.options.data or default_data()
+        found = find_cases(dataset, data, self.options.count(usual))
         if not found:
-            self.skipped[dataset] = "the folder is not there"
+            self.skipped[dataset] = f"no folder {dataset} with pictures in {data.name or data}; --data says where else"
         return found
 
     @property

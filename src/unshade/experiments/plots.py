@@ -104,8 +104,18 @@ def robustness(document: Document, path: Path) -> None:
         _panels(path, len(DAMAGES), fill)
 
 
+UNSEEN = {
+    "psnr": "PSNR, dB",
+    "child_psnr": "PSNR of children, dB",
+    "tree_psnr": "PSNR of trees, dB",
+    "type": "types right",
+    "first_top": "nats",
+}
+"""What is drawn of unseen nodes beside the loss: the first of these that a log has."""
+
+
 def learning(folder: Path, path: Path) -> bool:
-    """Losses of every model whose log is in a folder; False where there is none."""
+    """Losses of every model whose log is in a folder, and a figure of unseen nodes; False where there is none."""
     logs = sorted(folder.glob("*.jsonl"))
     if not logs:
         return False
@@ -117,6 +127,16 @@ def learning(folder: Path, path: Path) -> bool:
             panel.plot([line["step"] for line in told], [line["loss"] for line in told], linewidth=1)
             panel.set_yscale("log")
             _finish(panel, log.stem, "step", "loss")
+            unseen = [line for line in lines if line["split"] == "test"]
+            figure = next((name for name in UNSEEN if unseen and f"realistic_{name}" in unseen[0]), None)
+            if figure is not None:
+                beside = panel.twinx()
+                for k, style in enumerate(("realistic", "toon"), 1):
+                    beside.plot(
+                        [line["step"] for line in unseen], [line[f"{style}_{figure}"] for line in unseen], color=f"C{k}", label=style
+                    )
+                beside.set_ylabel(f"unseen nodes: {UNSEEN[figure]}", fontsize=8)
+                beside.legend(fontsize=7, loc="center right")
 
     _panels(path, len(logs), fill)
     return True
