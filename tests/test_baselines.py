@@ -183,6 +183,16 @@ def test_the_trained_baselines_see_something(name: str) -> None:
     assert psnr(render(found, sphere_normals(64)), picture, disc_mask(64)) > psnr(torch.zeros_like(picture), picture, disc_mask(64))
 
 
+def test_the_configuration_is_that_of_the_weights() -> None:
+    """`unshade train` with `small` trains as those that ship were trained, the baselines included."""
+    small = find("small")
+    for name in (*weights.MODELS, *weights.SEARCH, *weights.BASELINES):
+        loaded = weights.load(name)
+        assert loaded.config.training[name] == small.training[name], name
+        assert dataclasses.replace(loaded.config, training=small.training) == small, name
+        assert loaded.card["steps"] == small.training[name].steps
+
+
 def test_mistakes_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(UnshadeError, match="did you mean 'lstm'"):
         baselines.Baseline.load("lstn")

@@ -170,9 +170,9 @@ SMALL = Config(
         "prior": TrainingConfig(steps=8_000, batch=16, learning_rate=1e-3, weight_decay=0.01),
         "heads": TrainingConfig(steps=3_000, batch=32, learning_rate=1e-3, weight_decay=0.01),
         "reflection": TrainingConfig(steps=8_600, batch=32, learning_rate=1e-3, decay=0.8, weight_decay=0.01),
-        "cnn": TrainingConfig(steps=8_000, batch=16, learning_rate=1e-3, weight_decay=0.01),
-        "lstm": TrainingConfig(steps=8_000, batch=16, learning_rate=1e-3, weight_decay=0.01),
-        "transformer": TrainingConfig(steps=8_000, batch=16, learning_rate=5e-4, weight_decay=0.01),
+        "cnn": TrainingConfig(steps=8_000, batch=16, learning_rate=3e-4, weight_decay=0.01),
+        "lstm": TrainingConfig(steps=8_000, batch=16, learning_rate=3e-3, weight_decay=0.01),
+        "transformer": TrainingConfig(steps=8_000, batch=16, learning_rate=3e-3, weight_decay=0.01),
     },
 )
 """Trains on two cores within hours; its weights ship with the package."""

@@ -34,7 +34,7 @@ FOLDER = Path(__file__).resolve().parent.parent / "weights"
 """Of the weights that ship with the package."""
 
 BASELINE_FOLDER = FOLDER.parents[2] / "benchmarks" / "weights"
-"""Of the baselines, in a checkout of the repository: five times the size of the package's, and nothing but the experiments reads them."""
+"""Of the baselines, in a checkout of the repository: twice the size of the package's, and nothing but the experiments reads them."""
 
 MODELS: dict[str, Callable[[Config], nn.Module]] = {"vqvae": VQVAE, "prior": Priors, "heads": Heads}
 """What the learned method needs; the name of a file is that of its training task."""
