@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,13 +20,14 @@ import torch
 from click.testing import CliRunner
 from torch import Tensor
 
-from unshade import model_card, processes, train
+from unshade import model_card, processes, tasks, train
 from unshade.checkpoint import CheckpointError
 from unshade.cli import cli
 from unshade.cli_train import MODELS
 from unshade.errors import MissingWeightsError
 from unshade.models import weights
 from unshade.models.config import Config, TrainingConfig, find
+from unshade.synthesis import Batch
 from unshade.tasks import overlap, psnr
 from unshade.train import Run, learning_rate
 
@@ -119,13 +122,55 @@ def test_more_steps_may_be_asked_for_later(tmp_path: Path) -> None:
     assert finish(run_of(tmp_path, steps=4)) == []
 
 
-@pytest.mark.parametrize("change", [{"seed": 1}, {"style": "toon"}, {"precision": "bfloat16"}, {"batch": 5}])
-def test_a_run_goes_on_only_as_it_began(change: dict[str, Any], tmp_path: Path) -> None:
+def test_a_second_call_says_what_it_finds(tmp_path: Path) -> None:
+    def note(steps: int, rate: float = 3e-3) -> str:
+        return next(train.train(Run("vqvae", config(steps, rate=rate), tmp_path))).notes[-1]
+
+    finish(run_of(tmp_path, steps=2))
+    assert note(2).startswith("done before, 2 of 2 steps; more --steps go on")
+    assert "nothing was trained with learning_rate 0.5 instead of 0.003;" in note(2, rate=0.5)
+    assert note(4, rate=0.5) == "going on from step 2, now with steps 4 instead of 2, learning_rate 0.5 instead of 0.003"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"seed": 1}, "seed 0, not 1;"),
+        ({"style": "toon"}, "style both, not toon;"),
+        ({"precision": "bfloat16"}, "precision float32, not bfloat16;"),
+        ({"batch": 5}, "begun with batch 4, not 5;"),
+        ({"codes": 8, "batch": 5}, "begun with vqvae.codes 16, not 8; batch 4, not 5;"),
+    ],
+)
+def test_a_run_goes_on_only_as_it_began(change: dict[str, Any], said: str, tmp_path: Path) -> None:
     finish(run_of(tmp_path, steps=1))
-    run = Run("vqvae", config(2, change.pop("batch", 4)), tmp_path, **change)
+    options = dict(change)
+    wanted = config(2, options.pop("batch", 4))
+    wanted = dataclasses.replace(wanted, vqvae=dataclasses.replace(wanted.vqvae, codes=options.pop("codes", wanted.vqvae.codes)))
     with pytest.raises(CheckpointError, match="choose another folder") as caught:
-        finish(run)
+        finish(Run("vqvae", wanted, tmp_path, **options))
+    assert said in str(caught.value) and "steps" not in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("broken", [3, 1])
+def test_a_run_that_diverges_keeps_its_last_good_state(broken: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Although it saves after every step here; and no state is named that is not there."""
+    outcome, calls = tasks.VQVAETask.outcome, iter(range(1, 9))
+
+    def diverges(self: tasks.VQVAETask, model: torch.nn.Module, batch: Batch) -> tasks.Outcome:
+        found = outcome(self, model, batch)
+        return dataclasses.replace(found, loss=found.loss * (torch.nan if next(calls) == broken else 1.0))
+
+    monkeypatch.setattr(train, "SAVE_EVERY_SECONDS", -1.0)
+    monkeypatch.setattr(tasks.VQVAETask, "outcome", diverges)
+    run = run_of(tmp_path, report_every=100, evaluate_every=100)
+    with pytest.raises(train.TrainingError, match=rf"the loss is nan.* at step {broken};") as caught:
+        finish(run)
+    assert run.state.exists() == (str(run.state) in str(caught.value)) == (broken > 1)
+    if broken > 1:
+        assert all(bool(value.isfinite().all()) for value in tensors(run).values())
+        assert next(train.train(run)).step == broken - 1
 
 
 @pytest.mark.parametrize("data", [b"", b"state", "cut"])
@@ -223,25 +268,72 @@ def test_the_commands_mistakes(tmp_path: Path) -> None:
     assert run(["train", "vqvae", "--config", "tiny", "-o", str(tmp_path / "file")]) == 5
 
 
+@pytest.mark.parametrize("rate", ["nan", "inf", "-inf", "0", "-0.1"])
+def test_a_rate_is_a_number_over_0(rate: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from unshade.cli import run
+
+    assert run(["train", "vqvae", "--config", "tiny", "--steps", "1", f"--rate={rate}", "-o", str(tmp_path / "run")]) == 2
+    assert "expected a finite learning rate over 0" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_the_command_knows_every_task() -> None:
     assert set(MODELS) <= set(train.TASKS)
 
 
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "unshade"]
+
+
 @pytest.mark.slow
-def test_two_processes_learn_together(tmp_path: Path) -> None:
-    """What torchrun sets is set by hand. Both take the same steps, so the state of the first is that of both."""
-    command = [sys.executable, "-m", "unshade", "train", "vqvae", "--config", "tiny", "--steps", "3", "-o", str(tmp_path), "--json"]
+def test_two_processes_train_all(tmp_path: Path) -> None:
+    """Under torchrun they meet once for all four models, and the first one speaks."""
+    command = [*TORCHRUN, "train", "all", "--config", "tiny", "--steps", "2", "-o", str(tmp_path), "--json"]
+    done = subprocess.run(command, capture_output=True, timeout=300)
+    assert done.returncode == 0, done.stderr.decode()
+    assert [json.loads(line)["task"] for line in done.stdout.splitlines()] == list(MODELS)
+    assert weights.read_card(weights.file_of("vqvae", tmp_path / "weights"))["examples"] == 2 * 4 * 2
+
+
+def test_the_command_joins_one_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second group of the same processes often cannot connect."""
+    places, place = [], processes.place
+
+    @contextlib.contextmanager
+    def counted() -> Iterator[processes.Place]:
+        with place() as found:
+            places.append(found)
+            yield found
+
+    monkeypatch.setattr(processes, "place", counted)
+    done = CliRunner().invoke(cli, ["train", "all", "--config", "tiny", "--steps", "1", "-q", "-o", str(tmp_path)])
+    assert (done.exit_code, len(places)) == (0, 1), done.output
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_two_processes_stop_quietly(tmp_path: Path) -> None:
+    """Ctrl-C reaches them from the terminal and once more from torchrun; what torchrun sets is set by hand, to see how each ends."""
+    command = [sys.executable, "-m", "unshade", "train", "all", "--config", "tiny", "--steps", "100000", "-o", str(tmp_path), "--json"]
     base = {**os.environ, "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(20_000 + os.getpid() % 20_000)}
     started = [
         subprocess.Popen(command, env={**base, "RANK": str(rank), "LOCAL_RANK": str(rank)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         for rank in range(2)
     ]
-    outputs = [process.communicate(timeout=120) for process in started]
-    assert [process.returncode for process in started] == [0, 0], outputs
-    assert outputs[0][0].count(b"\n") == 1
-    assert outputs[1][0] == b""
-    card = weights.read_card(weights.file_of("vqvae", tmp_path / "weights"))
-    assert card["examples"] == 3 * 4 * 2
+    try:
+        assert started[0].stdout is not None and started[0].stdout.readline()
+        for _ in range(2):
+            for process in started:
+                process.send_signal(signal.SIGINT)
+            time.sleep(0.1)
+        outputs = [process.communicate(timeout=120)[1].decode() for process in started]
+    finally:
+        for process in started:
+            process.kill()
+    assert [process.returncode for process in started] == [130, 130], outputs
+    assert outputs[0].count("interrupted") == 1 and "Traceback" not in outputs[0]
+    assert outputs[1] == ""
+    run = run_of(tmp_path)
+    assert json.loads(safetensors.safe_open(run.state, "pt").metadata()["position"])["step"] >= 50
 
 
 def test_the_model_card_is_of_the_weights_that_ship() -> None:

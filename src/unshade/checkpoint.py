@@ -20,6 +20,9 @@ from unshade.errors import UnshadeError
 from unshade.files import write_whole
 from unshade.models.config import BASELINES, Config, ConfigError
 
+FREE = ("steps", "learning_rate", "warmup", "decay", "weight_decay", "clip")
+"""What of a training may change on the way."""
+
 
 class CheckpointError(UnshadeError):
     """A training state that is damaged, or belongs to another run."""
@@ -67,11 +70,13 @@ def save(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, positio
     write_whole(path, safetensors.torch.save({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, header))
 
 
-def resume(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, identity: Identity) -> Position:
+def resume(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, identity: Identity) -> tuple[Position, list[str]]:
     """Put the state of a file into a model and its optimiser.
 
     The steps and rates of training may have been changed since; sizes, batch, style, seed, precision and processes may not.
 
+    Returns:
+        Where the run is, and what of its training was changed since, as ``learning_rate 0.001 instead of 0.003``.
     Raises:
         CheckpointError: the file is damaged, or of another run.
     """
@@ -81,7 +86,7 @@ def resume(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, ident
         tensors = safetensors.torch.load_file(path)
     except (safetensors.SafetensorError, OSError, ValueError) as error:
         raise CheckpointError(f"{path}: the training state is damaged ({error}); delete it to begin again") from None
-    _check(path, header, identity)
+    changes = _check(path, header, identity)
     try:
         model.load_state_dict({key.removeprefix("model."): value for key, value in tensors.items() if key.startswith("model.")})
         state: dict[int, dict[str, Tensor]] = {}
@@ -90,29 +95,35 @@ def resume(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, ident
                 _, number, name = key.split(".", 2)
                 state.setdefault(int(number), {})[name] = value
         optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
-        return Position(**json.loads(header["position"]))
+        return Position(**json.loads(header["position"])), changes
     except (RuntimeError, KeyError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise CheckpointError(f"{path}: the training state does not fit this version ({reason}); delete it to begin again") from None
 
 
-def _check(path: Path, header: dict[str, str], identity: Identity) -> None:
+def _check(path: Path, header: dict[str, str], identity: Identity) -> list[str]:
+    """What may have been changed and was. Raises CheckpointError for what may not."""
     wanted = identity.header()
-    for key in sorted(wanted):
-        was: Any = header.get(key)
-        now: Any = wanted[key]
-        if key == "config" and was is not None:
-            try:
-                was, now = (_fixed(config, identity.task) for config in (Config.from_json(was), identity.config))
-            except ConfigError as error:
-                raise CheckpointError(f"{path}: the training state is damaged ({error}); delete it to begin again") from None
-        if was != now:
-            what = f"another {key}" if key == "config" else f"{key} {was}, not {now}"
-            raise CheckpointError(f"{path}: this run was begun with {what}; go on with the same, or choose another folder")
+    wrong = [f"{key} {header.get(key)}, not {wanted[key]}" for key in wanted if key != "config" and header.get(key) != wanted[key]]
+    try:
+        was = _settings(Config.from_json(header.get("config", "")), identity.task)
+    except ConfigError as error:
+        raise CheckpointError(f"{path}: the training state is damaged ({error}); delete it to begin again") from None
+    now, changes = _settings(identity.config, identity.task), []
+    for name in (name for name in was | now if was.get(name) != now.get(name)):
+        if name in FREE:
+            changes.append(f"{name} {now[name]} instead of {was[name]}")
+        else:
+            wrong.append(f"{name} {was.get(name)}, not {now.get(name)}")
+    if wrong:
+        raise CheckpointError(f"{path}: this run was begun with {'; '.join(wrong)}; go on as it began, or choose another folder")
+    return changes
 
 
-def _fixed(config: Config, task: str) -> tuple[Any, ...]:
-    """What of a configuration cannot change on the way."""
-    learned = (config.vqvae, config.prior, config.heads)
-    own = config.baselines if task in BASELINES else config.reflection if task == "reflection" else learned
-    return config.size, own, config.training[task].batch
+def _settings(config: Config, task: str) -> dict[str, Any]:
+    """What of a configuration a task depends on: ``size``, ``batch``, ``vqvae.codes`` and so on. Raises ConfigError."""
+    if task not in config.training:
+        raise ConfigError(f"no training of {task}")
+    parts = ("baselines",) if task in BASELINES else ("reflection",) if task == "reflection" else ("vqvae", "prior", "heads")
+    sizes = {f"{part}.{name}": value for part in parts for name, value in vars(getattr(config, part)).items()}
+    return {"size": config.size, **sizes, **vars(config.training[task])}

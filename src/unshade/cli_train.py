@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,23 @@ MODELS = ("vqvae", "prior", "heads", "reflection")
 
 BASELINES = ("cnn", "lstm", "transformer")
 
+INTERRUPTED = 130
+"""The exit code of `unshade.cli` for it."""
+
+
+class Rate(click.FloatRange):
+    """A finite number over 0."""
+
+    def __init__(self) -> None:
+        super().__init__(0.0, min_open=True)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """As click has it, but neither nan nor inf."""
+        rate = float(click.FLOAT.convert(value, param, ctx))
+        if not 0.0 < rate < math.inf:
+            self.fail(f"expected a finite learning rate over 0, such as 0.001, got {value}", param, ctx)
+        return rate
+
 
 @click.command()
 @click.argument("model", type=click.Choice([*MODELS, "baseline", "all"]))
@@ -41,7 +59,7 @@ BASELINES = ("cnn", "lstm", "transformer")
 )
 @click.option("--steps", type=click.IntRange(1), metavar="N", help="Steps in all instead of the configuration's.")
 @click.option("--batch", type=click.IntRange(1), metavar="N", help="Examples of a step and process instead of the configuration's.")
-@click.option("--rate", type=click.FloatRange(0.0, min_open=True), metavar="R", help="Learning rate instead of the configuration's.")
+@click.option("--rate", type=Rate(), metavar="R", help="Learning rate instead of the configuration's.")
 @click.option(
     "--style", type=click.Choice(["both", "realistic", "toon"]), default="both", show_default=True, help="Which trees to learn from."
 )
@@ -88,6 +106,7 @@ def train(
       unshade train reflection --precision bfloat16 --workers 1 -o run
       unshade train baseline lstm -o run
     """
+    from unshade import processes
     from unshade import train as loop
     from unshade.models.config import find
     from unshade.terminal import Messages
@@ -97,10 +116,16 @@ def train(
     check_folder(output)
     found, messages = find(config), Messages(quiet or not loop.leads())
     names = {"all": MODELS, "baseline": (baseline,) if baseline else BASELINES}
-    for task in names.get(model, (model,)):
-        run = loop.Run(task, _changed(found, task, steps, batch, rate), output, **options)
-        for progress in loop.train(run):
-            _tell(progress, messages, as_json and loop.leads())
+    runs = [loop.Run(task, _changed(found, task, steps, batch, rate), output, **options) for task in names.get(model, (model,))]
+    try:
+        with processes.place() as place:
+            for run in runs:
+                for progress in loop.train(run, place):
+                    _tell(progress, messages, as_json and place.leads)
+    except KeyboardInterrupt:
+        if loop.leads():
+            raise
+        raise click.exceptions.Exit(INTERRUPTED) from None  # the first process says it for all
     if model == "all" and loop.leads():
         from unshade.model_card import write_card
 

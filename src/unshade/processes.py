@@ -23,11 +23,12 @@ class DeviceError(UnshadeError):
 
 @dataclass(frozen=True)
 class Place:
-    """This process among all, and its device."""
+    """This process among all, its device, and whether a person asked it to stop."""
 
     rank: int
     processes: int
     device: torch.device
+    asked: Callable[[], bool]
 
     @property
     def leads(self) -> bool:
@@ -59,19 +60,24 @@ class Place:
 
 @contextlib.contextmanager
 def place() -> Iterator[Place]:
-    """The GPU where there is one, else the CPU; joined to the others where torchrun set WORLD_SIZE."""
+    """The GPU where there is one, else the CPU; joined to the others where torchrun set WORLD_SIZE.
+
+    Once for all that a command trains: torchrun's processes can meet only once.
+    """
     gpu = torch.cuda.is_available()
     processes = int(os.environ.get("WORLD_SIZE", "1"))
     if processes == 1:
-        yield Place(0, 1, torch.device("cuda" if gpu else "cpu"))
+        with stop_flag() as asked:
+            yield Place(0, 1, torch.device("cuda" if gpu else "cpu"), asked)
         return
     device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if gpu else torch.device("cpu")
     if gpu:
         torch.cuda.set_device(device)
     torch.distributed.init_process_group("nccl" if gpu else "gloo")
     try:
-        yield Place(torch.distributed.get_rank(), processes, device)
-        torch.distributed.barrier()  # none may leave while another still talks to it
+        with stop_flag(patient=True) as asked:
+            yield Place(torch.distributed.get_rank(), processes, device, asked)
+            torch.distributed.barrier()  # none may leave while another still talks to it
     finally:
         torch.distributed.destroy_process_group()
 
@@ -96,21 +102,25 @@ def seeded(seed: int, step: int, rank: int = 0) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stop_flag() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM only raise a flag, so that a step is never cut in two; the second Ctrl-C ends it at once."""
-    asked = threading.Event()
+def stop_flag(patient: bool = False) -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and SIGTERM only raise a flag, so that a step is never cut in two; the second Ctrl-C ends it at once.
+
+    ``patient``: the first one counts and later ones do not, not even behind the block. For torchrun, which sends on what the terminal
+    has sent already, and kills who takes longer than half a minute.
+    """
+    raised = threading.Event()
 
     def ask(number: int, frame: FrameType | None) -> None:
-        if asked.is_set():
+        if raised.is_set() and not patient:
             raise KeyboardInterrupt
-        asked.set()
+        raised.set()
 
     if threading.current_thread() is not threading.main_thread():
-        yield asked.is_set
+        yield raised.is_set
         return
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield asked.is_set
+        yield raised.is_set
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_IGN if patient and raised.is_set() else handler)

@@ -6,6 +6,7 @@ DIR/weights/TASK.safetensors (what it is for). Everything random in a step comes
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import platform
@@ -95,26 +96,31 @@ class Progress:
     notes: tuple[str, ...] = ()
 
 
-def train(run: Run) -> Iterator[Progress]:
+def train(run: Run, place: processes.Place | None = None) -> Iterator[Progress]:
     """Train one model from where its run is to the end of its steps.
 
     Ctrl-C or SIGTERM lets the step end, saves, and raises KeyboardInterrupt; a second one stops at once. After a kill, a later call
     repeats what came after the last save, with the same losses.
 
+    Args:
+        run: what to train.
+        place: where, if several runs share one; under torchrun they must.
     Raises:
         TrainingError, CheckpointError, DeviceError, MissingWeightsError, OutputError.
     """
     training = run.training
-    with processes.place() as place, processes.stop_flag() as stopped:
+    with contextlib.nullcontext(place) if place else processes.place() as place:
         precision = processes.precision(run.precision, place.device)
         task = TASKS[run.task](run.config, run.weights, place.device)
         with processes.seeded(run.seed, 0):
             model = task.build().to(place.device)
         optimizer = torch.optim.AdamW(model.parameters(), lr=training.learning_rate, betas=(0.9, 0.99), weight_decay=training.weight_decay)
         identity = Identity(run.task, run.config, run.style, run.seed, str(precision).removeprefix("torch."), place.processes)
-        position = checkpoint.resume(run.state, model, optimizer, identity) if run.state.is_file() else Position()
+        position, changes = Position(), list[str]()
+        if run.state.is_file():
+            position, changes = checkpoint.resume(run.state, model, optimizer, identity)
         log = Log(run.folder / run.task, position.step, writes=place.leads)
-        notes = (*log.notes, *task.notes(), *([f"going on from step {position.step}"] if position.step else []))
+        notes = (*log.notes, *task.notes(), *_where(run, position, changes))
         yield Progress(run.task, position.step, training.steps, notes=notes if place.leads else ())
 
         first, began, earlier = position.step, time.monotonic(), position.seconds
@@ -126,25 +132,25 @@ def train(run: Run) -> Iterator[Progress]:
             optimizer.zero_grad()
             outcome.loss.backward()
             place.average_gradients(model)
-            nn.utils.clip_grad_norm_(model.parameters(), training.clip)
+            loss, length = float(outcome.loss.detach()), float(nn.utils.clip_grad_norm_(model.parameters(), training.clip))
+            if place.anyone(not (math.isfinite(loss) and math.isfinite(length))):
+                raise TrainingError(_diverged(run, position, loss, length))
             optimizer.param_groups[0]["lr"] = learning_rate(training, position.step)
             optimizer.step()
 
             position.step += 1
             position.seconds = earlier + time.monotonic() - began
-            position.loss_sum += float(outcome.loss.detach())
+            position.loss_sum += loss
             position.loss_count += 1
             evaluates = position.step % run.evaluate_every == 0 or position.step == training.steps
             if evaluates or position.step % run.report_every == 0:
                 loss, figures = position.loss_sum / position.loss_count, {key: float(value) for key, value in outcome.figures.items()}
-                if not math.isfinite(loss):
-                    raise TrainingError(f"{run.task}: the loss is {loss} at step {position.step}; the last good state is in {run.state}")
                 position.loss_sum, position.loss_count = 0.0, 0
                 log.add(position.step, {"loss": loss, **figures}, "train")
                 test = _look(run, task, model, position, log) if evaluates and place.leads else {}
                 left = (time.monotonic() - began) / (position.step - first) * (training.steps - position.step)
                 yield Progress(run.task, position.step, training.steps, loss, figures, test, left)
-            stops = place.anyone(stopped())
+            stops = place.anyone(place.asked())
             if place.leads and (evaluates or stops or time.monotonic() - saved > SAVE_EVERY_SECONDS):
                 checkpoint.save(run.state, model, optimizer, position, identity)
                 saved = time.monotonic()
@@ -159,6 +165,23 @@ def learning_rate(training: TrainingConfig, step: int) -> float:
     up = (step + 1) / max(training.warmup, 1)
     down = (training.steps - step) / max(training.decay * training.steps, 1.0)
     return training.learning_rate * min(1.0, up, down)
+
+
+def _where(run: Run, position: Position, changes: list[str]) -> list[str]:
+    """What a person should know of a run that was begun before."""
+    if not position.step:
+        return []
+    if position.step >= run.training.steps:
+        others = [change for change in changes if not change.startswith("steps")]
+        unused = f"; nothing was trained with {', '.join(others)}" if others else ""
+        return [f"done before, {position.step} of {run.training.steps} steps{unused}; more --steps go on, another folder begins anew"]
+    return [f"going on from step {position.step}{', now with ' * bool(changes)}{', '.join(changes)}"]
+
+
+def _diverged(run: Run, position: Position, loss: float, length: float) -> str:
+    """What to say where the next step would lead nowhere."""
+    saved = f"the last good state is in {run.state}" if run.state.is_file() else "no state was saved yet"
+    return f"{run.task}: the loss is {loss:.4g}, its gradient {length:.4g} long, at step {position.step + 1}; {saved}; try a lower --rate"
 
 
 def _batches(run: Run, task: Task[Any], step: int, place: processes.Place) -> Iterator[Any]:
