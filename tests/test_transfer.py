@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,16 +13,19 @@ from hypothesis import given
 
 from strategies import trees
 from unshade.analogy import analogy
+from unshade.cli import run as run_command
 from unshade.components import Component, put_together, take_apart, uses
 from unshade.edit import component, components, mix, move_light, remove, set_value, transfer
 from unshade.errors import PictureError, TreeError
 from unshade.grammar import sample
 from unshade.metrics import psnr
+from unshade.models import weights
 from unshade.nodes import Leaf, Tree, walk
+from unshade.pictures import write_picture
 from unshade.render import render
 from unshade.replay import match, replay
 from unshade.serde import parse
-from unshade.sphere import sphere_normals
+from unshade.sphere import disc_mask, sphere_normals
 
 NORMALS = sphere_normals(32, dtype=torch.float64)
 
@@ -166,12 +172,53 @@ def test_lights_that_stand_for_an_environment_move_with_it() -> None:
 
 
 def test_analogy_refuses() -> None:
+    grey = parse("multiply(albedo(#808080), diffuse(left up))")
     with pytest.raises(TreeError, match="no component of B changes A"):
-        analogy(A, A, A, A, A)
+        analogy(grey, grey, transfer(B, grey, "albedo"), A, A)
     told: list[str] = []
     with pytest.raises(PictureError, match="no such file"):
         analogy(render(A, sphere_normals(256)).clamp(0, 1), A, "nosuch.png", A, A, told=told.append)
     assert not told, "nothing is decomposed before all five are read"
+
+
+@pytest.mark.parametrize("as_picture", [False, True])
+def test_an_analogy_in_which_nothing_moved_is_refused_before_the_work(as_picture: bool) -> None:
+    picture = (render(A, sphere_normals(256)) * 255.0).round() / 255.0
+    told: list[str] = []
+    with pytest.raises(TreeError, match=r"nothing was moved: AB is A, \d+\.\d dB apart"):
+        analogy(picture if as_picture else A, B, picture, picture, B, told=told.append)
+    assert not told
+
+
+def test_an_analogy_is_not_sure_where_nothing_explains_ab_better() -> None:
+    """AB is A with some noise, as another encoder leaves it."""
+    dark = parse("multiply(albedo(#301010), diffuse(left up))")
+    noise = 0.01 * torch.randn(3, 256, 256, generator=torch.Generator().manual_seed(0))
+    found = analogy(dark, B, (render(dark, sphere_normals(256)) + noise).clamp(0, 1), A, B)
+    assert not found.sure and found.report()["sure"] is False
+    assert re.match(r"AB is nearer to A as it is, \d+\.\d dB", found.report()["doubt"])
+
+
+def test_an_analogy_says_how_reflections_were_held(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert analogy(A, B, transfer(B, A, "albedo"), A, B).report()["reflections"] is None, "no picture was decomposed"
+    write_picture(tmp_path / "p.png", render(parse("albedo(red)"), sphere_normals(64)).clamp(0, 1), disc_mask(64).float())
+    words = ["analogy", "albedo(red)", "albedo(blue)", "albedo(blue)", str(tmp_path / "p.png"), "albedo(gold)", "--preset", "draft"]
+    note = "reflections were held as lights, since the network for pictures of them is missing"
+    for folder, held in ((weights.FOLDER, "picture"), (tmp_path, "lights")):
+        if held == "lights" or weights.file_of("reflection", folder).is_file():
+            monkeypatch.setattr(weights, "FOLDER", folder)
+            assert run_command([*words, "-o", str(tmp_path / held)]) == 0
+            assert (note in capsys.readouterr().err) == (held == "lights")
+            assert json.loads((tmp_path / held / "analogy.json").read_text(encoding="utf-8"))["reflections"] == held
+
+
+def test_damaged_weights_of_reflections_are_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(weights, "FOLDER", tmp_path)
+    weights.file_of("reflection", tmp_path).write_bytes(b"no weights")
+    with pytest.raises(weights.WeightsError, match="damaged"):
+        analogy(A, B, transfer(B, A, "albedo"), render(A, sphere_normals(256)).clamp(0, 1), B)
 
 
 # The same edit on another tree

@@ -31,6 +31,9 @@ from unshade.types import Image, Mask
 
 Source: TypeAlias = "Tree | SphereImage | torch.Tensor | str | Path"
 
+Reflections: TypeAlias = Literal["lights", "picture"]
+"""How a reflected environment is held, see `decompose`."""
+
 VISIBLE = 50.0
 """dB between two pictures from which they count as the same."""
 
@@ -58,6 +61,8 @@ class Explanation:
     """dB between AB and A with each component of B, best first; only components whose move changes A."""
     seen: Component | None = None
     """What the pictures tell, where no component explains AB well."""
+    still: float = -math.inf
+    """dB between AB and A as it is."""
 
     @property
     def component(self) -> Component | None:
@@ -82,6 +87,8 @@ class Analogy:
     explanation: Explanation
     trees: dict[str, Tree]
     """The trees of A, B, P and Q."""
+    reflections: Reflections | None = None
+    """How what pictures reflect was held; None where none was decomposed."""
 
     @property
     def scores(self) -> dict[Component, float]:
@@ -95,19 +102,30 @@ class Analogy:
         return best[0] - best[1] if len(best) > 1 else math.inf
 
     @property
+    def doubt(self) -> str:
+        """Why something else may have been moved; empty where that is unlikely."""
+        if self.explanation.seen is not None:
+            return "told from the pictures, the trees do not explain it"
+        if next(iter(self.scores.values())) <= self.explanation.still:
+            return f"AB is nearer to A as it is, {self.explanation.still:.1f} dB"
+        return f"the next explanation is {self.margin:.1f} dB away" if self.margin < SURE else ""
+
+    @property
     def sure(self) -> bool:
         """Is the margin large enough, and do the trees hold what was moved?"""
-        return self.margin >= SURE and self.explanation.seen is None
+        return not self.doubt
 
     def report(self) -> dict[str, Any]:
         """What was understood, for JSON."""
         return {
             "component": self.component.value,
             "sure": self.sure,
+            "doubt": self.doubt,
             "seen_in_pictures": self.explanation.seen is not None,
             "margin_db": None if math.isinf(self.margin) else round(self.margin, 2),
             "scores_db": {which.value: round(min(score, 200.0), 2) for which, score in self.scores.items()},
             "understood": f"AB is A with the {self.component.value} of B; the answer is P with the {self.component.value} of Q",
+            "reflections": self.reflections,
             "values": {name: tree.values for name, tree in {**self.trees, "answer": self.tree}.items()},
         }
 
@@ -127,24 +145,30 @@ def analogy(
 
     Args:
         a, b, ab, p, q: trees or pictures. Pictures other than AB are decomposed first, with ``preset`` and ``seed``, and where the
-            network for it is there, with what they reflect as a picture, which can be moved whole.
+            network for it is there, with what they reflect as a picture, which can be moved whole; else as lights, and
+            `Analogy.reflections` says so.
         told: called with the name of each picture before it is decomposed.
     Raises:
-        PictureError: a picture cannot be used. TreeError: no component of B changes A, or the blend spaces differ.
+        PictureError: a picture cannot be used. TreeError: AB is A, no component of B changes A, or the blend spaces differ.
+        WeightsError: the weights of that network are damaged.
     """
     # All are read before the first is decomposed, so that a bad one is told at once.
     read = {name: _read(source) for name, source in {"A": a, "B": b, "AB": ab, "P": p, "Q": q}.items()}
-    goal = read.pop("AB")
+    goal, valid = _picture(read.pop("AB"))
+    before, counts = _picture(read["A"])
+    if (still := psnr(goal, before, counts & valid)) >= VISIBLE:
+        raise TreeError(f"nothing was moved: AB is A, {min(still, 200.0):.1f} dB apart, so nothing can be understood from it")
+    held = _held() if any(not isinstance(source, Tree) for source in read.values()) else None
     seen = {}
     for name, source in read.items():
         if told is not None and not isinstance(source, Tree):
             told(name)
-        seen[name] = _seen(source, preset, seed)
-    found = explain(seen["A"], seen["B"], *_picture(goal))
+        seen[name] = _seen(source, preset, seed, held or "lights")
+    found = explain(seen["A"], seen["B"], goal, valid)
     if found.component is None:
         raise TreeError("no component of B changes A, so nothing can be understood from AB")
     answer = found.apply(seen["Q"].tree, seen["P"].tree)
-    return Analogy(answer, found.component, found, {name: one.tree for name, one in seen.items()})
+    return Analogy(answer, found.component, found, {name: one.tree for name, one in seen.items()}, held)
 
 
 def explain(a: Seen, b: Seen, ab: Image, valid: Mask) -> Explanation:
@@ -154,15 +178,16 @@ def explain(a: Seen, b: Seen, ab: Image, valid: Mask) -> Explanation:
     """
     normals = thinned(sphere_normals(SIZE))
     before = render(a.tree, normals)
-    wanted = thinned(ab - a.image)
+    wanted, counts = thinned(ab - a.image), thinned(a.valid & valid)
     found = {}
     for which in Component:
         change = render(transfer(b.tree, a.tree, which), normals) - before
         if psnr(change, torch.zeros_like(change)) < VISIBLE:
-            found[which] = psnr(change, wanted, thinned(a.valid & valid))
+            found[which] = psnr(change, wanted, counts)
     best = dict(sorted(found.items(), key=lambda entry: -entry[1]))
     is_clear = any(score > CLEAR for score in best.values())
-    return Explanation(best, None if is_clear else moved(a.image, b.image, ab, a.valid & b.valid & valid))
+    seen = None if is_clear else moved(a.image, b.image, ab, a.valid & b.valid & valid)
+    return Explanation(best, seen, psnr(wanted, torch.zeros_like(wanted), counts))
 
 
 def _read(source: Source) -> Tree | SphereImage:
@@ -181,12 +206,13 @@ def _picture(source: Tree | SphereImage) -> tuple[Image, Mask]:
     return source.image, source.valid
 
 
-def _seen(source: Tree | SphereImage, preset: str, seed: int) -> Seen:
-    if isinstance(source, Tree):
-        tree = source
-    else:
-        from unshade.models import weights
+def _held() -> Reflections:
+    """As a picture where the network for it is there."""
+    from unshade.models import weights
 
-        held: Literal["lights", "picture"] = "picture" if weights.file_of("reflection").is_file() else "lights"
-        tree = decompose(source, preset=preset, seed=seed, reflections=held).result().tree
+    return "picture" if weights.file_of("reflection").is_file() else "lights"
+
+
+def _seen(source: Tree | SphereImage, preset: str, seed: int, held: Reflections) -> Seen:
+    tree = source if isinstance(source, Tree) else decompose(source, preset=preset, seed=seed, reflections=held).result().tree
     return Seen(*_picture(source), tree)

@@ -78,7 +78,9 @@ def mix(first: str, second: str, take: tuple[str, ...], output: Path, picture: P
 def analogy(a: str, b: str, ab: str, p: str, q: str, output: Path, preset: str, seed: int, quiet: bool, as_json: bool) -> None:
     """Do to P what was done to A: AB is A with one component of B; find which, and give P that component of Q.
 
-    Each of the five is a picture of a sphere or a TREE. Pictures are decomposed first; AB is only looked at.
+    Each of the five is a picture of a sphere or a TREE. Pictures are decomposed first; AB is only looked at. Where AB is
+    A, the exit code is 4. analogy.json says what was understood, whether that is sure, and whether reflections were held
+    as a picture or, without the network for it, as lights.
 
     \b
     Examples:
@@ -112,12 +114,11 @@ def analogy(a: str, b: str, ab: str, p: str, q: str, output: Path, preset: str, 
         dump(found.tree, folder / TREE_FILE)
     if as_json:
         click.echo(json.dumps(report))
-    if found.explanation.seen is not None:
-        messages.say(f"{report['understood']} (not surely: told from the pictures, the trees do not explain it)")
-        return
-    best = next(iter(found.scores.values()))
-    doubt = "" if found.sure else f", not surely: the next explanation is {found.margin:.1f} dB away"
-    messages.say(f"{report['understood']} ({min(best, 200.0):.1f} dB{doubt})")
+    if found.reflections == "lights":
+        messages.say("reflections were held as lights, since the network for pictures of them is missing (unshade train reflection)")
+    best = "" if found.explanation.seen is not None else f"{min(next(iter(found.scores.values())), 200.0):.1f} dB"
+    doubt = f"not surely: {found.doubt}" if found.doubt else ""
+    messages.say(f"{report['understood']} ({', '.join(filter(None, (best, doubt)))})")
 
 
 def _tree_or_picture(source: str) -> Tree | Path:
