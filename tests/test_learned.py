@@ -467,6 +467,19 @@ def test_without_weights_learned_says_so_and_the_rest_goes_on(tmp_path: Path) ->
     assert instead.stages is not None and instead.stages["method"] == "search" and "no such weights" in instead.stages["why"]
 
 
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("prior", r"unshade train all \(`unshade decompose --method search` needs none\)"),
+        ("reflection", r"unshade train reflection \(`unshade decompose --reflections lights` needs none\)"),
+        ("lstm", "unshade train baseline lstm$"),
+    ],
+)
+def test_missing_weights_say_how_to_train_them_and_what_needs_none(name: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(MissingWeightsError, match=says):
+        weights.load(name, tmp_path)
+
+
 def test_weights_that_do_not_belong_together_are_refused(tiny: Path, tmp_path: Path) -> None:
     for name in weights.MODELS:
         weights.file_of(name, tmp_path).write_bytes(weights.file_of(name, tiny).read_bytes())

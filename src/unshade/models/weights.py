@@ -45,6 +45,12 @@ SEARCH: dict[str, Callable[[Config], nn.Module]] = {"reflection": ReflectionNet}
 BASELINES: dict[str, Callable[[Config], nn.Module]] = {"cnn": CNNBaseline, "lstm": LSTMBaseline, "transformer": TransformerBaseline}
 """What it is compared with."""
 
+WITHOUT = {
+    **dict.fromkeys(MODELS, " (`unshade decompose --method search` needs none)"),
+    **dict.fromkeys(SEARCH, " (`unshade decompose --reflections lights` needs none)"),
+}
+"""What can be had without some weights, for whoever looks for them in vain."""
+
 _ALL = {**MODELS, **SEARCH, **BASELINES}
 
 
@@ -95,9 +101,7 @@ def _training(name: str) -> str:
 
 def _header(path: Path) -> dict[str, str]:
     if not path.is_file():
-        raise MissingWeightsError(
-            f"{path}: no such weights; train them with: {_training(path.stem)}, or use --method search, which needs none"
-        )
+        raise MissingWeightsError(f"{path}: no such weights; train them with: {_training(path.stem)}{WITHOUT.get(path.stem, '')}")
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
