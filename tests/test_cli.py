@@ -12,7 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -544,6 +544,18 @@ def test_sample_is_seeded(tmp_path: Path, run: Run) -> None:
     printed = run("sample", "--count", 3, "--style", "toon", "--seed", 7).out.splitlines()
     assert [parse(line) for line in printed] == [load(tmp_path / "trees" / f"{k}.json") for k in range(3)]
     assert len(set(printed)) == 3
+
+
+def test_the_ablation_needs_the_method_that_it_takes_apart(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    import unshade.experiments
+
+    asked: list[Any] = []
+    monkeypatch.setattr(unshade.experiments, "run", lambda options: asked.append(options.parts) or SimpleNamespace(failed=[]))
+    told = run("experiments", "ablation", "wild", "--method", "search:draft", "-o", tmp_path)
+    assert told.code == 2 and "add --method learned" in told.err and not asked
+    assert run("experiments", "--method", "search:draft", "-o", tmp_path).code == 0
+    assert run("experiments", "--method", "learned", "-o", tmp_path).code == 0
+    assert "ablation" not in asked[0] and "wild" in asked[0] and "ablation" in asked[1]
 
 
 # --- as a program ----------------------------------------------------------------------------------------------------

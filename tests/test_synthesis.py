@@ -272,12 +272,15 @@ def test_an_interrupted_data_set_is_completed(tmp_path: Path) -> None:
 def test_a_changed_shard_is_found(tmp_path: Path) -> None:
     manifest = synthesis_shards.make(PLAN, tmp_path)
     path = tmp_path / manifest["shards"][2]["file"]
-    data = bytearray(path.read_bytes())
-    data[-1] ^= 1
-    path.write_bytes(data)
+    good, kept = path.read_bytes(), (tmp_path / manifest["shards"][0]["file"]).stat().st_mtime_ns
+    path.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
     (wrong,) = synthesis_shards.check(tmp_path)
     assert "shard-00002" in wrong
     assert "checksum" in wrong
+    # The same call writes it anew, and no other.
+    assert synthesis_shards.make(PLAN, tmp_path) == manifest
+    assert path.read_bytes() == good and synthesis_shards.check(tmp_path) == []
+    assert (tmp_path / manifest["shards"][0]["file"]).stat().st_mtime_ns == kept
 
 
 def test_a_full_disk_leaves_what_was_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,7 +44,7 @@ def make(output: Path, workers: int | None, quiet: bool, as_json: bool, **option
 
     STYLE is realistic, toon or both. DIR gets shards, safetensors files with the pictures and numbers of all nodes, and
     manifest.json with counts and checksums. A call that was cut short goes on where it stopped, and a larger N adds to what
-    is there.
+    is there. What is there is compared with its checksums, and a shard that was changed is written anew.
 
     \b
     Examples:

@@ -72,8 +72,8 @@ def experiments(
 
     decomposition compares all methods, analogy asks each for 300 edits a component by example, ablation takes the learned method apart,
     robustness spoils the pictures and looks at size, anytime looks at the trees on the way, wild shows what has no known tree. The
-    JSON behind the page goes to DIR/benchmarks/results/experiments. Data and weights that are not there are skipped by name. It can
-    be interrupted and goes on where it was.
+    JSON behind the page goes to DIR/benchmarks/results/experiments. Data and weights that are not there are skipped by name, and so
+    is the ablation where learned is not among the methods. It can be interrupted and goes on where it was.
 
     \b
     Examples:
@@ -85,7 +85,12 @@ def experiments(
     from unshade.experiments.options import METHODS
 
     check_folder(output)
-    ran = run(Options(parts or PARTS, methods or METHODS, data, output, limit, weights, training, seed, workers, perceptual, resume))
+    given, parts, methods = parts, parts or PARTS, methods or METHODS
+    if "learned" not in methods:
+        if "ablation" in given:
+            raise click.UsageError("ablation takes the method learned apart, which is not among those of --method; add --method learned")
+        parts = tuple(part for part in parts if part != "ablation")
+    ran = run(Options(parts, methods, data, output, limit, weights, training, seed, workers, perceptual, resume))
     if ran.failed:
         raise ExperimentsError(f"{len(ran.failed)} measurements failed; the first: {ran.failed[0]}")
 

@@ -68,7 +68,7 @@ class _Job:
 
 
 def make(plan: Plan, folder: Path, workers: int = 1, done: Callable[[int, int], None] = lambda made, total: None) -> dict[str, Any]:
-    """Write what is missing of a data set, and return its manifest.
+    """Write what is missing of a data set or not what its manifest says, and return the manifest.
 
     Args:
         plan: what to write.
@@ -128,6 +128,15 @@ def check(folder: Path) -> list[str]:
 
 def read_shard(folder: Path, entry: Entry) -> dict[str, torch.Tensor]:
     """The table of a shard: image (N, 3, S, S) uint8, kind, left, right, mask, tree (N,) and numbers (N, 6). Raises DatasetError."""
+    data = _bytes(folder, entry)
+    try:
+        return load(data)
+    except SafetensorError as error:
+        raise DatasetError(f"{folder / str(entry['file'])}: not a shard: {error}") from None
+
+
+def _bytes(folder: Path, entry: Entry) -> bytes:
+    """Of a shard as it was written. Raises DatasetError."""
     path = folder / str(entry["file"])
     try:
         data = path.read_bytes()
@@ -135,10 +144,15 @@ def read_shard(folder: Path, entry: Entry) -> dict[str, torch.Tensor]:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from None
     if hashlib.sha256(data).hexdigest() != entry["sha256"]:
         raise DatasetError(f"{path}: its checksum is not the manifest's: {len(data)} bytes, expected {entry['bytes']}")
+    return data
+
+
+def _is_whole(folder: Path, entry: Entry) -> bool:
     try:
-        return load(data)
-    except SafetensorError as error:
-        raise DatasetError(f"{path}: not a shard: {error}") from None
+        _bytes(folder, entry)
+    except DatasetError:
+        return False
+    return True
 
 
 def shard_batches(folder: Path, *, batch: int, seed: int, start: int = 0, device: torch.device | str = "cpu") -> Iterator[Batch]:
@@ -243,7 +257,7 @@ def _plan(manifest: dict[str, Any]) -> Plan:
 
 
 def _begun(plan: Plan, folder: Path) -> dict[int, Entry]:
-    """What is there already, by index. Raises OutputError where it is something else."""
+    """What is there already and whole, by index. Raises OutputError where it is something else."""
     if not (folder / MANIFEST).exists():
         if folder.is_dir() and any(folder.iterdir()):
             raise OutputError(f"{folder}: expected an empty folder, a new one, or one with a {MANIFEST}")
@@ -259,9 +273,8 @@ def _begun(plan: Plan, folder: Path) -> dict[int, Entry]:
     shards = plan.shards()
     found: dict[int, Entry] = {}
     for entry in manifest["shards"]:
-        index, path = entry["first_tree"] // plan.shard_trees, folder / entry["file"]
-        whole = path.exists() and path.stat().st_size == entry["bytes"]
-        if whole and index < len(shards) and shards[index] == (entry["first_tree"], entry["trees"]):
+        index = entry["first_tree"] // plan.shard_trees
+        if index < len(shards) and shards[index] == (entry["first_tree"], entry["trees"]) and _is_whole(folder, entry):
             found[index] = entry
     if manifest["trees"] > plan.trees:
         raise OutputError(f"{folder}: holds {manifest['trees']} trees, more than {plan.trees}; take another folder")
