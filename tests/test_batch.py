@@ -235,6 +235,8 @@ def test_check_folder_refuses_a_file_on_the_way(tmp_path: Path) -> None:
 def test_settings_are_told_apart_by_their_fingerprint(picture: Path) -> None:
     plain = Settings().fingerprint(picture)
     assert plain == json.loads(json.dumps(plain))
+    learned = Settings(method="learned").fingerprint(picture)
+    assert Settings(method="learned", device="cuda").fingerprint(picture) != learned != plain
     for other in (
         Settings(seed=1),
         Settings(preset="best"),

@@ -243,7 +243,8 @@ def test_decompose_writes_everything(decomposed: list[dict[str, Any]], ball: Pat
     )
     assert told.code == 0, told.err
     asked = {"preset": "best", "max_values": 40, "seed": 5, "alternatives": 2, "search": "depth", "objective": "l2"}
-    assert decomposed == [asked | {"method": "search", "second_stage": "size", "weights": None, "reflections": "lights"}]
+    networks = {"method": "search", "second_stage": "size", "weights": None, "reflections": "lights", "settings": None}
+    assert decomposed == [asked | networks]
     folder = tmp_path / "out" / "ball"
     assert {"tree.json", "render.png", "difference.png", "tree.svg", "report.html"} <= set(files(folder))
     assert len(list((folder / "layers").iterdir())) == 5
@@ -275,6 +276,7 @@ def test_json_has_the_promised_keys_and_types(decomposed: list[dict[str, Any]], 
         (["--second-stage", "size"], "--second-stage is of --method learned; --method search has none"),
         (["--second-stage", "depth", "--method", "hybrid"], "--method hybrid has none"),
         (["--weights", "nets"], "this asks no network"),
+        (["--device", "cuda"], "the search is on the CPU"),
     ],
 )
 def test_options_of_networks_that_nobody_asks_are_refused(
@@ -287,6 +289,18 @@ def test_options_of_networks_that_nobody_asks_are_refused(
 def test_weights_are_those_of_reflections_too(decomposed: list[dict[str, Any]], ball: Path, tmp_path: Path, run: Run) -> None:
     told = run("decompose", ball, "--artifacts", "none", "--weights", tmp_path, "--reflections", "picture")
     assert told.code == 0 and decomposed[0]["weights"] == str(tmp_path)
+
+
+def test_networks_may_be_on_another_device(decomposed: list[dict[str, Any]], ball: Path, run: Run) -> None:
+    from unshade import learned
+
+    words = ("decompose", ball, "--artifacts", "none", "--method")
+    assert run(*words, "learned", "--second-stage", "none", "--device", "meta").code == 0
+    assert run(*words, "hybrid", "--device", "meta").code == 0
+    assert decomposed[0]["settings"] == learned.Settings(second_stage="none", device="meta")
+    assert decomposed[1]["settings"] == dataclasses.replace(learned.PROPOSED, device="meta")
+    told = run(*words, "learned", "--device", "warp:9")
+    assert told.code == 1 and "--device warp:9: cannot be used here" in told.err and len(decomposed) == 2
 
 
 def test_missing_weights_are_told_before_the_work(

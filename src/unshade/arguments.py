@@ -40,6 +40,13 @@ class Disc(click.ParamType):
 def network_options(function: Any) -> Any:
     """What `decompose` asks networks for; see `check_networks`."""
     for option in (
+        click.option(
+            "--device",
+            default="cpu",
+            show_default=True,
+            metavar="NAME",
+            help="Where the networks of --method learned or hybrid draw, such as cuda; other trees come out there. Fits stay on the CPU.",
+        ),
         click.option("--weights", type=click.Path(path_type=str), metavar="DIR", help="Networks of `unshade train`, not those that ship."),
         click.option(
             "--reflections",
@@ -76,6 +83,8 @@ def check_networks(options: Mapping[str, Any]) -> None:
     method = options.get("method", "search")
     if method != "learned" and given("second_stage"):
         raise click.UsageError(f"--second-stage is of --method learned; --method {method} has none")
+    if method == "search" and given("device"):
+        raise click.UsageError("--device is of --method learned or hybrid; the search is on the CPU")
     if method == "search" and given("weights") and options["reflections"] != "picture":
         raise click.UsageError("--weights are of --method learned or hybrid, or of --reflections picture; this asks no network")
 
