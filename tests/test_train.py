@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -336,6 +337,10 @@ def test_two_processes_stop_quietly(tmp_path: Path) -> None:
     assert json.loads(safetensors.safe_open(run.state, "pt").metadata()["position"])["step"] >= 50
 
 
-def test_the_model_card_is_of_the_weights_that_ship() -> None:
-    path = Path(__file__).resolve().parent.parent / "docs" / "model-card.md"
-    assert path.read_text(encoding="utf-8") == model_card.page(weights.FOLDER, weights.BASELINE_FOLDER)
+def test_the_model_cards_are_of_the_weights_that_ship() -> None:
+    """The page of the documentation, and the one in the package."""
+    root = Path(__file__).resolve().parent.parent
+    assert (root / "docs" / "model-card.md").read_text(encoding="utf-8") == model_card.page(weights.FOLDER, weights.BASELINE_FOLDER)
+    assert (weights.FOLDER / model_card.CARD).read_text(encoding="utf-8") == model_card.page(weights.FOLDER)
+    packaged = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["package-data"]["*"]
+    assert {"weights/*.safetensors", "weights/*.md"} <= set(packaged)

@@ -55,12 +55,15 @@ MEANINGS = {
 }
 STYLES = ("realistic", "toon")
 
+CARD = "model-card.md"
+"""Name of the page, beside the weights."""
+
 HEAD = """# Model card
 
 The weights that ship with `unshade`, written by `unshade train all`. The learned method reads all but `reflection`, which tells a search
 what a picture reflects. This page is made from what stands in the files (`scripts/model_card.py`). Safetensors, parameters in half
-precision; how they were trained: [training](training.md). The baselines, which nothing but the [experiments](experiments.md) reads, are
-not in the package; they lie in `benchmarks/weights` of the repository.
+precision; how they were trained stands in `docs/training.md` of the repository. The baselines, which nothing but the experiments reads
+(`docs/experiments.md`), are not in the package; they lie in `benchmarks/weights` of the repository.
 
 Made for node images of shade trees: synthetic shaded spheres of the released grammar and wider ones, black outside the disc. Figures
 are of nodes from the test half of the data, whose colours, directions, masks and environment maps occur in no training tree. Photographs
@@ -76,7 +79,7 @@ def page(*folders: Path) -> str:
 
 def write_card(folder: Path) -> Path:
     """Put the page beside the weights. Raises OutputError."""
-    path = folder / "model-card.md"
+    path = folder / CARD
     write_whole(path, page(folder).encode())
     return path
 
