@@ -18,7 +18,7 @@ from unshade.forest import CODES, Forest, Outline, grow
 from unshade.model_card import page
 from unshade.models import weights
 from unshade.models.config import CONFIGS, Config, ConfigError, ReflectionConfig, find
-from unshade.models.reflection import ReflectionNet
+from unshade.models.reflection import DARKEST, ReflectionNet, without
 from unshade.reflection_data import ReflectionBatch, ReflectionBatches, rendered
 from unshade.reflection_task import ReflectionTask
 from unshade.render import render
@@ -50,6 +50,15 @@ def test_the_two_pictures_make_the_one(name: str) -> None:
     assert float(environment.min()) >= 0.0 <= float(plain.min())
     assert bool((environment <= pictures).all())
     assert torch.allclose(screen(environment, plain), pictures, atol=1e-6)
+
+
+def test_under_the_brightest_environments_the_plain_picture_stays_in_range() -> None:
+    pictures = torch.linspace(0.9, 1.0, 401).expand(1, 3, 1, -1)
+    for share in (0.0, 0.9, 0.999, 1.0):
+        environment = share * pictures
+        plain = without(pictures, environment)
+        assert 0.0 <= float(plain.min()) <= float(plain.max()) <= 1.0
+        assert float((screen(environment, plain) - pictures).abs().max()) <= DARKEST
 
 
 def test_it_sees_the_whole_picture_and_where_it_is() -> None:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from unshade.synthesis import Style
 
 SMOOTHED = 1e-5
-"""Squared errors far under this, half a percent, count as squares, those over it as absolute errors."""
+"""Added to squared errors under a root: errors far over its own root, 0.32 % of the range, count as absolute ones, those far under it as
+squares."""
 
 
 class ReflectionTask(Task[ReflectionBatch]):

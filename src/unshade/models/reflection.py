@@ -41,9 +41,13 @@ class ReflectionNet(nn.Module):
         self.share = nn.Sequential(nn.GroupNorm(GROUPS, widths[0]), nn.SiLU(), nn.Conv2d(widths[0], 4 * 3, 3, 1, 1))
 
     def forward(self, pictures: Image) -> tuple[Image, Image]:
-        """Environment and plain picture of pictures (B, 3, S, S) in [0, 1], each alike; ``screen`` of the two is the picture.
+        """Take pictures apart.
 
-        The environment is in [0, picture]. So the plain picture is in [0, 1], but for pixels near 1 where it is what the division gives.
+        Args:
+            pictures: (B, 3, S, S) in [0, 1].
+        Returns:
+            Environments in [0, picture] and plain pictures in [0, 1], (B, 3, S, S) each. ``screen`` of the two is the picture, to within
+            `DARKEST` where an environment is so bright that nothing beneath it can be seen.
         """
         places = self.places.expand(len(pictures), -1, -1, -1)
         # Twice as fast on CPUs in this order of memory.
