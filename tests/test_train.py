@@ -29,6 +29,7 @@ from unshade.errors import MissingWeightsError
 from unshade.models import weights
 from unshade.models.config import Config, TrainingConfig, find
 from unshade.synthesis import Batch
+from unshade.synthesis_shards import Plan, make
 from unshade.tasks import overlap, psnr
 from unshade.train import Run, learning_rate
 
@@ -182,6 +183,61 @@ def test_a_damaged_state_is_one_line(data: bytes | str, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"damaged.*delete it") as caught:
         finish(run_of(tmp_path, steps=2))
     assert "\n" not in str(caught.value)
+
+
+def test_shards_train_and_go_on(tmp_path: Path) -> None:
+    """Bit for bit, over the ends of rounds."""
+    plan = Plan("both", "train", 5, 16, 4, 2)
+    made = make(plan, tmp_path / "data")
+    assert made["examples"] < 12 * 4
+    whole, cut = (run_of(tmp_path / name, steps=12, shards=tmp_path / "data") for name in ("whole", "cut"))
+    finish(whole)
+    for progress in train.train(cut):
+        if progress.step == 6:
+            break
+    assert next(train.train(cut)).step == 4
+    finish(cut)
+    assert lines(cut) == lines(whole)
+    assert all(torch.equal(value, tensors(cut)[key]) for key, value in tensors(whole).items())
+    assert "shards: 4 trees of seed 5" in weights.read_card(weights.file_of("vqvae", whole.weights))["data"]
+    with pytest.raises(CheckpointError, match=r"begun with shards 4 trees of seed 5 \(\w+\), not none;"):
+        finish(run_of(whole.folder, steps=16))
+    for change, said in (({"style": "toon"}, "style toon, got style both"), ({"task": "reflection"}, "whole trees")):
+        with pytest.raises(train.TrainingError, match=said):
+            finish(dataclasses.replace(whole, **change))
+    with pytest.raises(train.UnshadeError, match="manifest"):
+        finish(dataclasses.replace(whole, shards=tmp_path))
+
+
+def test_the_command_trains_from_shards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With nothing drawn for them."""
+    make(Plan("both", "train", 5, 16, 8, 4), tmp_path / "data")
+    stream = tasks.Task.stream
+
+    def only_tests(self: tasks.Task[Any], style: Any, split: str, **options: Any) -> Iterator[Any]:
+        assert split == "test"
+        return stream(self, style, split, **options)
+
+    monkeypatch.setattr(tasks.Task, "stream", only_tests)
+    for model in ("vqvae", "prior", "heads"):
+        command = [
+            "train",
+            model,
+            "--config",
+            "tiny",
+            "--steps",
+            "2",
+            "--shards",
+            str(tmp_path / "data"),
+            "-q",
+            "-o",
+            str(tmp_path / "run"),
+        ]
+        done = CliRunner().invoke(cli, command)
+        assert done.exit_code == 0, (done.output, done.exception)
+    done = CliRunner().invoke(cli, ["train", "all", "--config", "tiny", "--shards", str(tmp_path / "data"), "-o", str(tmp_path / "all")])
+    assert "reflection learns from whole trees" in str(done.exception)
+    assert not (tmp_path / "all").exists()
 
 
 def test_prior_needs_a_vqvae_of_its_configuration(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ class CNNTask(Task["Batch"]):
     """Children, operator, mask and types of a node, at once."""
 
     name = "cnn"
+    reads_shards = True
 
     def build(self) -> nn.Module:
         """See `Task`."""

@@ -48,6 +48,8 @@ class Identity:
     seed: int
     precision: str
     processes: int
+    shards: str = "none"
+    """Which written examples it learns from, if not from the grammar."""
 
     def header(self) -> dict[str, str]:
         """As strings, for a file."""
@@ -58,6 +60,7 @@ class Identity:
             "seed": str(self.seed),
             "precision": self.precision,
             "processes": str(self.processes),
+            "shards": self.shards,
         }
 
 
@@ -103,7 +106,7 @@ def resume(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, ident
 
 def _check(path: Path, header: dict[str, str], identity: Identity) -> list[str]:
     """What may have been changed and was. Raises CheckpointError for what may not."""
-    wanted = identity.header()
+    wanted, header = identity.header(), {"shards": "none", **header}
     wrong = [f"{key} {header.get(key)}, not {wanted[key]}" for key in wanted if key != "config" and header.get(key) != wanted[key]]
     try:
         was = _settings(Config.from_json(header.get("config", "")), identity.task)

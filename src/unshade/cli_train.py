@@ -74,6 +74,12 @@ class Rate(click.FloatRange):
 @click.option(
     "--workers", type=click.IntRange(0), default=0, show_default=True, metavar="N", help="Processes that make data beside the training."
 )
+@click.option(
+    "--shards",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Learn from a folder of `unshade dataset make`, not from examples drawn on the way; of vqvae, prior, heads and the cnn.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object a report, one a line, on standard output.")
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
 def train(
@@ -103,6 +109,7 @@ def train(
     Examples:
       unshade train all --config small -o run
       unshade train vqvae --config paper --batch 64 -o paper
+      unshade train vqvae --shards data -o run
       unshade train reflection --precision bfloat16 --workers 1 -o run
       unshade train baseline lstm -o run
     """
@@ -117,6 +124,8 @@ def train(
     found, messages = find(config), Messages(quiet or not loop.leads())
     names = {"all": MODELS, "baseline": (baseline,) if baseline else BASELINES}
     runs = [loop.Run(task, _changed(found, task, steps, batch, rate), output, **options) for task in names.get(model, (model,))]
+    for run in runs:
+        loop.shards_of(run)  # what cannot be read is said before hours of training
     try:
         with processes.place() as place:
             for run in runs:

@@ -53,6 +53,8 @@ class Task(ABC, Generic[Data]):
     name: str
     data = "unshade.synthesis"
     """Where its examples are from, for the card of its weights."""
+    reads_shards = False
+    """Whether it learns from a `synthesis.Batch`, which shards hold as well."""
 
     def __init__(self, config: Config, folder: Path, device: torch.device) -> None:
         self.config, self.folder, self.device = config, folder, device
@@ -106,6 +108,7 @@ class VQVAETask(Task):
     """Encode and decode every node image of a batch, parents and children."""
 
     name = "vqvae"
+    reads_shards = True
 
     def build(self) -> nn.Module:
         """See `Task`."""
@@ -165,6 +168,7 @@ class PriorTask(Task):
     """Foretell the codes of the first child from those of the parent, and of the second from both."""
 
     name = "prior"
+    reads_shards = True
 
     def __init__(self, config: Config, folder: Path, device: torch.device) -> None:
         super().__init__(config, folder, device)
@@ -213,6 +217,7 @@ class HeadsTask(Task):
     """Read operators, masks and types, from true images and from such as the decoder makes."""
 
     name = "heads"
+    reads_shards = True
 
     def __init__(self, config: Config, folder: Path, device: torch.device) -> None:
         super().__init__(config, folder, device)

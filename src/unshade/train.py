@@ -7,6 +7,7 @@ DIR/weights/TASK.safetensors (what it is for). Everything random in a step comes
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import math
 import os
 import platform
@@ -27,6 +28,7 @@ from unshade.models import weights
 from unshade.models.config import Config, TrainingConfig
 from unshade.picture_output import write_picture
 from unshade.reflection_task import ReflectionTask
+from unshade.synthesis_shards import read_manifest, shard_batches
 from unshade.tasks import HeadsTask, PriorTask, Task, VQVAETask
 from unshade.training_log import Log
 
@@ -61,6 +63,8 @@ class Run:
     """float32, bfloat16, or auto: bfloat16 on a GPU that has it."""
     workers: int = 0
     """Processes that make data."""
+    shards: Path | None = None
+    """A written data set to learn from, instead of drawing from the grammar."""
     report_every: int = 50
     evaluate_every: int = 500
 
@@ -106,16 +110,17 @@ def train(run: Run, place: processes.Place | None = None) -> Iterator[Progress]:
         run: what to train.
         place: where, if several runs share one; under torchrun they must.
     Raises:
-        TrainingError, CheckpointError, DeviceError, MissingWeightsError, OutputError.
+        TrainingError, CheckpointError, DatasetError, DeviceError, MissingWeightsError, OutputError.
     """
     training = run.training
     with contextlib.nullcontext(place) if place else processes.place() as place:
+        shards = shards_of(run)
         precision = processes.precision(run.precision, place.device)
         task = TASKS[run.task](run.config, run.weights, place.device)
         with processes.seeded(run.seed, 0):
             model = task.build().to(place.device)
         optimizer = torch.optim.AdamW(model.parameters(), lr=training.learning_rate, betas=(0.9, 0.99), weight_decay=training.weight_decay)
-        identity = Identity(run.task, run.config, run.style, run.seed, str(precision).removeprefix("torch."), place.processes)
+        identity = Identity(run.task, run.config, run.style, run.seed, str(precision).removeprefix("torch."), place.processes, shards)
         position, changes = Position(), list[str]()
         if run.state.is_file():
             position, changes = checkpoint.resume(run.state, model, optimizer, identity)
@@ -186,10 +191,29 @@ def _diverged(run: Run, position: Position, loss: float, length: float) -> str:
 
 def _batches(run: Run, task: Task[Any], step: int, place: processes.Place) -> Iterator[Any]:
     """The batches from a step to the last; another process draws from another seed."""
-    seed = run.seed + 7_919 * place.rank
-    stream = task.stream(run.style, "train", batch=run.training.batch, seed=seed, start=step, workers=run.workers)
+    seed, batch = run.seed + 7_919 * place.rank, run.training.batch
+    stream: Iterator[Any]
+    if run.shards:
+        stream = shard_batches(run.shards, batch=batch, seed=seed, start=step, device=place.device)
+    else:
+        stream = task.stream(run.style, "train", batch=batch, seed=seed, start=step, workers=run.workers)
     for _ in range(step, run.training.steps):
         yield next(stream)
+
+
+def shards_of(run: Run) -> str:
+    """What the run's shards are, ``none`` where it has none. Raises TrainingError, DatasetError for those that it cannot learn from."""
+    if run.shards is None:
+        return "none"
+    if not TASKS[run.task].reads_shards:
+        able = ", ".join(task.name for task in _TASKS if task.reads_shards)
+        raise TrainingError(f"{run.task} learns from whole trees and draws them itself; shards hold nodes, for {able}")
+    manifest = read_manifest(run.shards)
+    for name, wanted in (("size", run.config.size), ("split", "train"), ("style", run.style), ("complete", True)):
+        if manifest.get(name) != wanted:
+            raise TrainingError(f"{run.shards}: expected shards with {name} {wanted}, got {name} {manifest.get(name)}")
+    seals = hashlib.sha256(" ".join(entry["sha256"] for entry in manifest["shards"]).encode()).hexdigest()
+    return f"{manifest['trees']} trees of seed {manifest['seed']} ({seals[:8]})"
 
 
 def _look(run: Run, task: Task[Any], model: nn.Module, position: Position, log: Log) -> dict[str, float]:
@@ -227,7 +251,8 @@ def card(run: Run, position: Position, figures: dict[str, float]) -> dict[str, A
     return {
         "model": run.task,
         "config": run.config.name,
-        "data": f"{TASKS[run.task].data}, style {run.style}, split train, seed {run.seed}",
+        "data": f"{TASKS[run.task].data}, style {run.style}, split train, "
+        + (f"shards: {shards_of(run)}" if run.shards else f"seed {run.seed}"),
         "steps": position.step,
         "of": run.training.steps,
         "examples": position.step * run.training.batch * int(os.environ.get("WORLD_SIZE", "1")),
