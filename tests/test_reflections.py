@@ -13,6 +13,7 @@ import torch
 
 from unshade import metrics, reflections
 from unshade.analogy import analogy
+from unshade.batch import stages_words
 from unshade.circles import edge_circles, edge_masks
 from unshade.cli import run as run_command
 from unshade.components import Component
@@ -22,6 +23,8 @@ from unshade.environments import blurred, raster
 from unshade.errors import MissingWeightsError, TreeError, UnshadeError
 from unshade.experiments import methods, subjects
 from unshade.grammar import same_structure
+from unshade.inference import Inference
+from unshade.learned import Settings
 from unshade.models import weights
 from unshade.models.config import find
 from unshade.models.reflection import ReflectionNet
@@ -231,6 +234,13 @@ def test_a_reflection_is_held_as_a_picture() -> None:
     lights, chosen = result.family.members[-2:]
     assert chosen.tree == result.tree and chosen.psnr > lights.psnr
     assert lights.values <= 64 < chosen.values
+
+
+def test_a_tree_in_the_place_of_the_networks_is_told() -> None:
+    few = Settings(Inference(samples=1, draws=1, trees=1))
+    result = decompose(shown(under(COAT)), method="hybrid", preset="draft", reflections="picture", settings=few).result()
+    assert result.stages is not None and result.stages["uncovered"] and result.tree.values > 24_576
+    assert "beneath a reflection" in stages_words(result.stages)
 
 
 def test_what_reflects_nothing_stays_as_it_is() -> None:

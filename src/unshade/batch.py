@@ -305,6 +305,8 @@ def stages_words(stages: Record | None) -> str:
         return ""
     if stages["why"]:
         return f"decomposed by {stages['method']} alone, since {stages['why']}"
+    if stages.get("uncovered"):
+        return "the tree of what lies beneath a reflection, in the place of the networks'"
     nodes, left = stages["nodes"], stages["second_stage_nodes"]
     found = left < nodes
     if stages["method"] == "hybrid":

@@ -335,18 +335,20 @@ def _by_size(
         if member.values < chosen.values and (curve[-1].psnr if curve else -math.inf) < member.psnr < chosen.psnr:
             curve.append(member)
     curve.append(chosen)
+    uncovered = False
     if uncover is not None and chosen.psnr < HELD:
         mirrored = chosen
         for root in uncover(sphere, chosen.tree.root):
             yield Step(chosen.tree, chosen.psnr, chosen.values, "reflections", total - 1, total)
             mirrored = _member(sphere, root) if root is not None else chosen
         if mirrored.psnr > chosen.psnr:
-            chosen = mirrored
+            chosen, uncovered = mirrored, True
             curve.append(chosen)
     family = Family(tuple(curve), len(curve) - 1, tuple(others))
     yield Step(chosen.tree, chosen.psnr, chosen.values, "done", total, total)
     stages = getattr(main, "stages", None)
-    yield Result(chosen.tree, family, chosen.psnr, seed, preset.name, stages.as_dict() if stages else None)
+    told = stages.as_dict() | {"uncovered": uncovered} if stages else None
+    yield Result(chosen.tree, family, chosen.psnr, seed, preset.name, told)
 
 
 def _left_out() -> Iterator[frozenset[str]]:
