@@ -166,14 +166,16 @@ small tree of what is beneath. It can be turned with the lights, taken off, and 
 the family, one size smaller. `unshade analogy` decomposes so by itself.
 
 How it is done: where a picture has edges, paints end; they are circles on the ball, found to a fraction of a pixel
-([circles.py](../src/unshade/circles.py); all of them and no other in 83 of 100 unseen trees). A small network guesses the picture beneath ([model card](model-card.md)). A tree
-with those paints and the guess's lights is then fitted to how the picture *bends*: in `log(1 - I) - log(1 - N)`, the logarithm
-of what the environment leaves, nothing of the tree N may be seen any more ([separation.py](../src/unshade/separation.py)). What
-is left over is the environment ([reflections.py](../src/unshade/reflections.py)).
+([circles.py](../src/unshade/circles.py); all of them and no other in 83 of 100 unseen trees). A small network guesses the picture
+beneath ([model card](model-card.md)). A tree with those paints and the guess's lights is then fitted to how the picture *bends*:
+in `log(1 - I) - log(1 - N)`, the logarithm of what the environment leaves, nothing of the tree N may be seen any more
+([separation.py](../src/unshade/separation.py)). What is left over is the environment
+([reflections.py](../src/unshade/reflections.py)).
 
 It is made for renderings and MatCaps in the words of the released grammar: one form, two masks at most, white highlights.
-Pictures with much grain (all of less than about 64 pixels seem to have it), those that a small tree holds at 48 dB, those in which
-the network sees no reflection, and drawings, whose edges would stay in what is left over, stay with lights. One paint alone does not tell how much of its brightness is reflected, so there the guess decides.
+Pictures with much grain (all of less than about 64 pixels seem to have it), those that a small tree holds at 48 dB, those in
+which the network sees no reflection, and drawings, whose edges would stay in what is left over, stay with lights. One paint alone
+does not tell how much of its brightness is reflected, so there the guess decides.
 
 ## Measured
 

@@ -1,7 +1,8 @@
 """Measure what cached sampling saves: children of one node drawn with the cache and without, which must be the same.
 
 Run: ``python scripts/measure_sampling.py --config small --samples 8``. With trained weights in ``--weights DIR`` the codes are those
-of the trained priors; the time does not depend on it.
+of the trained priors; the time does not depend on it. ``--pairs 24`` draws pairs of whole children instead, with the weights that ship or
+those of the folder.
 """
 
 from __future__ import annotations
@@ -12,9 +13,13 @@ from pathlib import Path
 
 import torch
 
+from unshade.inference import Networks
 from unshade.models import weights
 from unshade.models.config import CONFIGS, Config, find
 from unshade.models.pixelsnail import PixelSNAIL
+from unshade.render import render
+from unshade.serde import parse
+from unshade.sphere import sphere_normals
 
 
 def measure(net: PixelSNAIL, config: Config, samples: int, device: torch.device) -> tuple[float, float, bool]:
@@ -30,15 +35,35 @@ def measure(net: PixelSNAIL, config: Config, samples: int, device: torch.device)
     return seconds[1], seconds[2], bool(torch.equal(drawn[1], drawn[2]))
 
 
+def measure_pairs(samples: int, folder: Path | None, device: torch.device) -> tuple[float, float, bool]:
+    """The same for pairs of children of one node, a shaded ball."""
+    networks = Networks.load(folder, device)
+    ball = parse("screen(multiply(albedo(#c04030), diffuse(left up front, 0.3)), highlight(right up front, 40, 1.2))")
+    seconds, drawn = [], []
+    with torch.no_grad():
+        parent = networks.vqvae.encode(render(ball, sphere_normals(networks.config.size))[None].to(device))
+        for cached in (True, True, False):
+            began = time.perf_counter()
+            pair = networks.priors.sample_children(networks.vqvae, parent, samples, torch.Generator(device).manual_seed(0), 1.0, cached)
+            drawn.append(torch.cat([numbers.flatten().cpu() for codes in pair for numbers in (codes.top, codes.bottom)]))
+            seconds.append(time.perf_counter() - began)
+    return seconds[1], seconds[2], bool(torch.equal(drawn[1], drawn[2]))
+
+
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     options.add_argument("--config", choices=list(CONFIGS), default="small")
     options.add_argument("--samples", type=int, nargs="+", default=[1, 8, 32])
     options.add_argument("--weights", type=Path)
+    options.add_argument("--pairs", type=int)
     options.add_argument("--threads", type=int, default=1)
     given = options.parse_args()
     torch.set_num_threads(given.threads)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if given.pairs:
+        fast, slow, same = measure_pairs(given.pairs, given.weights, device)
+        print(f"{given.pairs} pairs: {fast:.2f} s with the cache, {slow:.1f} s without, {slow / fast:.0f} times; same codes: {same}")
+        return
     torch.manual_seed(0)
     config = find(given.config)
     priors = weights.load("prior", given.weights).model if given.weights else weights.MODELS["prior"](config)
