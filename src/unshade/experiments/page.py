@@ -160,7 +160,9 @@ def _run(document: Document) -> str:
 
 
 def _skipped(document: Document) -> list[str]:
-    lines = [f"- skipped `{name}`: {why}" for name, why in document["skipped"].items()]
+    """What is missing, and what was noted by hand of rows that an earlier run left."""
+    lines = [f"- {note}" for note in document.get("notes", [])]
+    lines += [f"- skipped `{name}`: {why}" for name, why in document["skipped"].items()]
     lines += [f"- failed: {what}" for what in document["failed"]]
     return [*lines, ""] if lines else []
 
