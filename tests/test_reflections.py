@@ -14,7 +14,7 @@ import torch
 from unshade import metrics, reflections
 from unshade.analogy import analogy
 from unshade.batch import stages_words
-from unshade.circles import edge_circles, edge_masks
+from unshade.circles import edge_circles, edge_masks, edges_left
 from unshade.cli import run as run_command
 from unshade.components import Component
 from unshade.decompose import Result, decompose
@@ -132,6 +132,14 @@ def test_edges_are_found_at_every_size(size: int | str) -> None:
     else:
         picture = torch.nn.functional.avg_pool2d(render(root, sphere_normals(1024)), 4)
     assert masks_right((picture * 255.0).round() / 255.0, stripe)
+
+
+def test_what_is_left_of_edges() -> None:
+    picture, bare = shown(pair("stripe(up front, 0.4, 0.4)", "stripe(left, 0.5, 0.6)")), shown(COAT)
+    circles = edge_circles(picture, DISC)
+    assert edges_left(circles, picture, picture) == 1.0
+    assert edges_left(circles, picture, bare) < 0.3
+    assert edges_left([], picture, bare) == 0.0
 
 
 def test_a_drawing_reflects_nothing() -> None:

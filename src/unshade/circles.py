@@ -8,9 +8,11 @@ Where a picture was scaled or its edges are smoothed, a jump takes up to three s
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 
 from unshade.nodes import Leaf, leaf
 from unshade.sphere import SCORED_RADIUS, disc_mask
@@ -86,17 +88,37 @@ def edge_masks(image: Image, valid: Mask, seed: int = 0) -> list[Leaf]:
     Args:
         image: (3, H, H) in [0, 1], without grain. valid: (1, H, H), pixels that count.
     """
+    return masks_of(edge_circles(image, valid, seed), image.shape[-1])
+
+
+def masks_of(circles: Sequence[Circle], size: int) -> list[Leaf]:
+    """The masks that end at circles of a picture of ``size``."""
     found: list[tuple[int, Leaf]] = []
-    circles = edge_circles(image, valid, seed)
-    while circles:
-        first = circles.pop(0)
-        stripe = next((pair for second in circles if (pair := _stripe(first, second, image.shape[-1]))), None)
+    waiting = list(circles)
+    while waiting:
+        first = waiting.pop(0)
+        stripe = next((pair for second in waiting if (pair := _stripe(first, second, size))), None)
         if stripe is None:
             found.append((len(first.places), leaf("threshold", direction=first.normal.tolist(), threshold=first.offset, softness=0.0)))
         else:
-            circles.remove(stripe[0])
+            waiting.remove(stripe[0])
             found.append((len(first.places) + len(stripe[0].places), stripe[1]))
     return [mask for _, mask in sorted(found, key=lambda entry: -entry[0])]
+
+
+def edges_left(circles: Sequence[Circle], before: Image, after: Image) -> float:
+    """How much of the jumps of a picture along its circles another picture still shows: 0 for nothing, 1 for all, the median place."""
+    if not circles:
+        return 0.0
+    size = before.shape[-1]
+    x, y, _ = torch.cat([circle.places for circle in circles]).T
+    row, column = (((1.0 - y) * 0.5 * size - 0.5).round().long(), ((x + 1.0) * 0.5 * size - 0.5).round().long())
+    jumps = []
+    for image in (before, after):
+        log = (1.0 - image.double()).clamp(min=0.5 / 255.0).log()
+        around = F.max_pool2d(log, 3, stride=1, padding=1) + F.max_pool2d(-log, 3, stride=1, padding=1)
+        jumps.append(around.amax(0)[row, column])
+    return float((jumps[1] / jumps[0].clamp(min=1e-9)).median())
 
 
 def edge_circles(image: Image, valid: Mask, seed: int = 0) -> list[Circle]:

@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 
 from unshade.atoms import dictionary_of, directions
-from unshade.circles import edge_circles, edge_masks
+from unshade.circles import edge_circles, edges_left, masks_of
 from unshade.fit.least_squares import COARSE_SIZE, fit_pixels
 from unshade.fit.pixels import Pixels
 from unshade.growth import Candidate, Effort, Growth, Samples
@@ -44,9 +44,8 @@ GRAIN = 6.0
 KNOWN = 200
 """Least pixels that are known and not white."""
 
-DRAWN, BRIGHT = 1.5, 0.3
-"""Length of the circles, in sides of the picture, that still end something in what is left for an environment, from which on it is a
-drawing; and the brightness that the network never takes a drawing's environment for."""
+DRAWN = 0.5
+"""Share of the jumps of a picture's edges in what is left for an environment from which on it is a drawing, or was not understood."""
 
 HEIGHT = 64
 """Rows of the environment's picture."""
@@ -120,7 +119,8 @@ def uncover(sphere: SphereImage, found: Node, network: ReflectionNet, seed: int)
     yield None
     pixels = Pixels.of(plain, valid, COARSE_SIZE)
     starts = []
-    for root in _starts(pixels, edge_masks(image, valid, seed)):
+    circles = edge_circles(image, valid, seed)
+    for root in _starts(pixels, masks_of(circles, sphere.size)):
         starts.append(separation.fit(root, 8))
         yield None
     current = separation.fit(min(starts, key=lambda separated: separated.cost).root, 25)
@@ -136,7 +136,7 @@ def uncover(sphere: SphereImage, found: Node, network: ReflectionNet, seed: int)
     root = separation.fit(current.root, 40, 1e-6).root
     under = render(root, sphere_normals(sphere.size))
     seen = (1.0 - (1.0 - image) / (1.0 - under).clamp(min=HIDDEN)).clamp(0.0, 1.0)
-    if share < BRIGHT and sum(len(circle.places) for circle in edge_circles(seen, valid, seed)) > DRAWN * sphere.size:
+    if edges_left(circles, image, seen) > DRAWN:
         return
     environment = panorama(seen, (1.0 - under).square() * valid)
     yield add_light(root, leaf("environment_map", pixels=Raster.from_array(environment)))
