@@ -42,10 +42,10 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE, RESULTS = ROOT / "docs" / "learned.md", ROOT / "benchmarks" / "results" / "learned.json"
 PARTS = ("table", "seconds")
 
-DRAWS = (12, 18, 64)
+DRAWS = (12, 64)
 """Budgets of nodes to draw for (`Inference.draws`) whose seconds are measured."""
 
-TIMED = 5
+TIMED = 4
 """Trees of each style that they are measured on."""
 
 MORE = dataclasses.replace(PRESETS["balanced"].effort, beam=4, beam_moves=8, trials=8, rounds=4, sweeps=2, settle_steps=28)
