@@ -164,6 +164,10 @@ def test_lights_that_stand_for_an_environment_move_with_it() -> None:
     both = transfer(b, a, "environment", stand_ins=True)
     assert [leaf.kind for _, leaf in walk(both.root) if "highlight" in leaf.kind] == ["highlight", "toon_highlight"]
     assert both.find("screen.1.highlight")["direction"] == a.find("screen.1.highlight")["direction"]  # type: ignore[index]
+    one, other = "screen(multiply(albedo(red), diffuse(left)), highlight(up, 8, 0.4))", "multiply(albedo(blue), diffuse(up))"
+    lit = parse(f"screen(mix({one}, {other}, threshold(left)), highlight(right, 60, 1))")
+    gone = transfer(parse("multiply(albedo(red), diffuse(left))"), lit, "environment", stand_ins=True)
+    assert sum(node.kind == "highlight" for _, node in walk(gone.root)) == 1, "the one on one side of the mask is gone, too"
     assert same(transfer(b, a, "environment"), a), "without it nothing of a highlight is an environment"
 
 

@@ -197,12 +197,16 @@ def reflecting(lit: Lit) -> Lit:
     if isinstance(lit, Over):
         return dataclasses.replace(lit, under=reflecting(lit.under))
     if isinstance(lit, Sides):
-        return dataclasses.replace(lit, left=reflecting(lit.left), right=reflecting(lit.right))
+        return _reflecting_sides(lit)
     lights = tuple(
         Light(Component.ENVIRONMENT, light.part) if light.component is Component.HIGHLIGHTS and not _is_strong(light.part.node) else light
         for light in lit.lights
     )
-    return dataclasses.replace(lit, lights=lights)
+    return dataclasses.replace(lit, base=_reflecting_sides(lit.base) if isinstance(lit.base, Sides) else lit.base, lights=lights)
+
+
+def _reflecting_sides(sides: Sides) -> Sides:
+    return dataclasses.replace(sides, left=reflecting(sides.left), right=reflecting(sides.right))
 
 
 def _is_strong(node: Node) -> bool:
