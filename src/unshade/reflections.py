@@ -44,8 +44,9 @@ GRAIN = 6.0
 KNOWN = 200
 """Least pixels that are known and not white."""
 
-DRAWN = 0.5
-"""Share of the jumps of a picture's edges in what is left for an environment from which on it is a drawing, or was not understood."""
+DRAWN, BRIGHT = 0.5, 0.2
+"""Share of the jumps of a picture's edges in what is left for an environment from which on it is a drawing, unless the network takes
+the environment for this bright."""
 
 HEIGHT = 64
 """Rows of the environment's picture."""
@@ -136,7 +137,7 @@ def uncover(sphere: SphereImage, found: Node, network: ReflectionNet, seed: int)
     root = separation.fit(current.root, 40, 1e-6).root
     under = render(root, sphere_normals(sphere.size))
     seen = (1.0 - (1.0 - image) / (1.0 - under).clamp(min=HIDDEN)).clamp(0.0, 1.0)
-    if edges_left(circles, image, seen) > DRAWN:
+    if share < BRIGHT and edges_left(circles, image, seen) > DRAWN:
         return
     environment = panorama(seen, (1.0 - under).square() * valid)
     yield add_light(root, leaf("environment_map", pixels=Raster.from_array(environment)))
