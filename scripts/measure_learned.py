@@ -153,12 +153,13 @@ def compared(args: argparse.Namespace) -> dict[str, Any]:
     cards = {
         name: weights.read_card(weights.file_of(name, args.weights)).get("steps") for name in weights.MODELS if full or name != "prior"
     }
-    return {"steps": cards, "seed": args.seed, "rows": rows}
+    return {"steps": cards, "seed": args.seed, "draws": Inference().draws, "rows": rows}
 
 
 def told(found: dict[str, Any]) -> str:
     trained = ", ".join(f"{name} {steps} steps" for name, steps in found["steps"].items())
-    return f"Networks: {trained}. Seed {found['seed']}; one thread of a busy machine.\n\n" + "\n".join(table(found["rows"]))
+    how = f"Seed {found['seed']}; `learned` draws for {found['draws']} nodes at most; one thread of a busy machine."
+    return f"Networks: {trained}. {how}\n\n" + "\n".join(table(found["rows"]))
 
 
 def timed(args: argparse.Namespace) -> dict[str, Any]:
