@@ -35,19 +35,22 @@ def measure(net: PixelSNAIL, config: Config, samples: int, device: torch.device)
     return seconds[1], seconds[2], bool(torch.equal(drawn[1], drawn[2]))
 
 
-def measure_pairs(samples: int, folder: Path | None, device: torch.device) -> tuple[float, float, bool]:
-    """The same for pairs of children of one node, a shaded ball."""
+def measure_pairs(samples: int, folder: Path | None, device: torch.device, double: bool) -> tuple[float, float, int]:
+    """Seconds with the cache and without for pairs of children of one node, a shaded ball, and how many pairs are the same."""
     networks = Networks.load(folder, device)
     ball = parse("screen(multiply(albedo(#c04030), diffuse(left up front, 0.3)), highlight(right up front, 40, 1.2))")
     seconds, drawn = [], []
     with torch.no_grad():
         parent = networks.vqvae.encode(render(ball, sphere_normals(networks.config.size))[None].to(device))
+        if double:
+            networks.priors.double()
+            parent = networks.vqvae.double().codes(parent.top, parent.bottom)
         for cached in (True, True, False):
             began = time.perf_counter()
             pair = networks.priors.sample_children(networks.vqvae, parent, samples, torch.Generator(device).manual_seed(0), 1.0, cached)
-            drawn.append(torch.cat([numbers.flatten().cpu() for codes in pair for numbers in (codes.top, codes.bottom)]))
+            drawn.append(torch.cat([numbers.flatten(1).cpu() for codes in pair for numbers in (codes.top, codes.bottom)], 1))
             seconds.append(time.perf_counter() - began)
-    return seconds[1], seconds[2], bool(torch.equal(drawn[1], drawn[2]))
+    return seconds[1], seconds[2], int((drawn[1] == drawn[2]).all(1).sum())
 
 
 def main() -> None:
@@ -56,13 +59,14 @@ def main() -> None:
     options.add_argument("--samples", type=int, nargs="+", default=[1, 8, 32])
     options.add_argument("--weights", type=Path)
     options.add_argument("--pairs", type=int)
+    options.add_argument("--double", action="store_true", help="pairs in float64, where rounding decides no draw")
     options.add_argument("--threads", type=int, default=1)
     given = options.parse_args()
     torch.set_num_threads(given.threads)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if given.pairs:
-        fast, slow, same = measure_pairs(given.pairs, given.weights, device)
-        print(f"{given.pairs} pairs: {fast:.2f} s with the cache, {slow:.1f} s without, {slow / fast:.0f} times; same codes: {same}")
+        fast, slow, alike = measure_pairs(given.pairs, given.weights, device, given.double)
+        print(f"{given.pairs} pairs: {fast:.2f} s with the cache, {slow:.1f} s without, {slow / fast:.0f} times; {alike} pairs the same")
         return
     torch.manual_seed(0)
     config = find(given.config)
