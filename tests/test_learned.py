@@ -19,7 +19,7 @@ import torch
 from unshade import batch, decoded, inference, learned, search_depth, second_stage, synthesis
 from unshade.cli import run as run_command
 from unshade.decompose import Result, decompose, fit
-from unshade.errors import MissingWeightsError, TreeError
+from unshade.errors import MissingWeightsError, TreeError, UnshadeError
 from unshade.fit.pixels import Pixels
 from unshade.grammar import same_structure
 from unshade.inference import Inference, Networks, Part, Pool, Round, Terms, criterion, infer, node_image
@@ -563,3 +563,9 @@ def test_the_shipped_networks_decompose(style: Any) -> None:
     assert found.stages is not None and found.stages["second_stage_share"] < 1.0
     one_colour = fit(image, Tree(leaf("albedo")))
     assert found.psnr > one_colour.psnr + 6.0
+
+
+def test_a_device_that_is_not_there() -> None:
+    for method in ("learned", "hybrid"):
+        with pytest.raises(UnshadeError, match="device warp:9: cannot be used here"):
+            decompose(torch.full((3, 64, 64), 0.5), method=method, device="warp:9")

@@ -142,13 +142,18 @@ def test_what_is_left_of_edges() -> None:
     assert edges_left([], picture, bare) == 0.0
 
 
-def test_a_drawing_reflects_nothing() -> None:
+def test_a_drawing_reflects_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The network takes some for photographs; what is left for the environment then still has the drawing's edges."""
-    drawing = shown(list(islice(trees("toon", "test", seed=77), 4))[3])
-    sphere = subjects.known(list(islice(trees("toon", "test", seed=77), 4))[3]).sphere
+    sphere = subjects.known(next(islice(trees("toon", "test", seed=77), 3, None))).sphere
     network = reflections.load()
-    assert reflections.beneath(drawing, DISC, network)[1] > reflections.SHOWS
-    assert list(filter(None, reflections.uncover(sphere, leaf("albedo"), network, 0))) == []
+    assert reflections.beneath(sphere.image, DISC, network)[1] > reflections.SHOWS
+
+    def uncovered() -> list[Node | None]:
+        return list(filter(None, reflections.uncover(sphere, leaf("albedo"), network, 0)))
+
+    assert uncovered() == []
+    monkeypatch.setattr(reflections, "DRAWN", 2.0)
+    assert len(uncovered()) == 1
 
 
 def test_uncovering_can_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:

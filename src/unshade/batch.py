@@ -22,7 +22,6 @@ from unshade.errors import OutputError, PictureError, UnshadeError
 from unshade.staging import TREE_FILE, discard
 
 if TYPE_CHECKING:
-    from unshade import learned
     from unshade.decompose import Result, Step
     from unshade.nodes import Tree
     from unshade.pictures import SphereImage
@@ -245,26 +244,12 @@ def _decompose_picture(job: Job, on_step: Callable[[Step], None] | None) -> Reco
         second_stage=settings.second_stage,
         weights=settings.weights,
         reflections=settings.reflections,
-        settings=_on_device(settings) if settings.device != "cpu" else None,
+        device=settings.device,
     )
     for step in decomposition:
         if on_step:
             on_step(step)
     return _written(job, decomposition.result(), sphere, begin)
-
-
-def _on_device(settings: Settings) -> learned.Settings:
-    """What `decompose` would take, but with the networks on another device. Raises UnshadeError where there is no such."""
-    import torch
-
-    from unshade import learned
-
-    try:
-        torch.empty(1, device=settings.device)
-    except (RuntimeError, AssertionError) as error:
-        raise UnshadeError(f"--device {settings.device}: cannot be used here: {str(error).partition(chr(10))[0]}") from error
-    own = learned.Settings(second_stage=settings.second_stage, objective=settings.objective)
-    return dataclasses.replace(learned.PROPOSED if settings.method == "hybrid" else own, device=settings.device)
 
 
 def fit_picture(job: Job, tree: Tree, locked: Sequence[str], anew: bool = False) -> Record:

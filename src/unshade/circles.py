@@ -1,4 +1,4 @@
-"""Drawn edges, found exactly: an edge of a mask is a circle on the sphere, where a plane ``n.d = t`` cuts it.
+"""Drawn edges: an edge of a mask is a circle on the sphere, where a plane ``n.d = t`` cuts it.
 
 A reflected photograph hides which paints a ball has, but not where they end: hardly a photograph jumps from one pixel to the next.
 Places of such jumps lie on circles, which random sampling finds to a few hundredths of a pixel (RANSAC; Fischler and Bolles 1981).
@@ -243,7 +243,7 @@ def _seen(circle: Circle, size: int) -> tuple[float, float]:
     """Share of what is visible of a circle that has places of it within three pixels, and how many rows and columns that crosses."""
     angle = torch.linspace(0.0, 2.0 * math.pi, 513, dtype=torch.float64)[:-1, None]
     helper = torch.eye(3, dtype=torch.float64)[int(circle.normal.abs().argmin())]
-    across = torch.nn.functional.normalize(torch.linalg.cross(circle.normal, helper), dim=0)
+    across = F.normalize(torch.linalg.cross(circle.normal, helper), dim=0)
     ring = angle.cos() * across + angle.sin() * torch.linalg.cross(circle.normal, across)
     radius = math.sqrt(max(1.0 - circle.offset**2, 0.0))
     points = circle.offset * circle.normal + radius * ring

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import torch
 
-from unshade.errors import MissingWeightsError, PictureError, TreeError, did_you_mean
+from unshade.errors import MissingWeightsError, PictureError, TreeError, UnshadeError, did_you_mean
 from unshade.fit.least_squares import error_of, fit_least_squares
 from unshade.growth import Effort, Samples, outline
 from unshade.metrics import psnr
@@ -117,6 +117,7 @@ def decompose(
     method: Literal["search", "learned", "hybrid"] = "search",
     second_stage: SecondStageName = "size",
     weights: str | Path | None = None,
+    device: str = "cpu",
     settings: Settings | None = None,
     reflections: Literal["lights", "picture"] = "lights",
 ) -> Decomposition:
@@ -136,13 +137,15 @@ def decompose(
         second_stage: of ``learned``, for nodes that the networks could not decompose: ``size`` is our search, ``depth``
             the paper's, minutes a picture, ``none`` makes them one colour.
         weights: folder of the networks; None for those that ship.
-        settings: all about the networks' part, instead of ``second_stage`` and the defaults; see `unshade.learned`.
+        device: where the networks of ``learned`` and ``hybrid`` are, such as ``cuda``; other samples come out there.
+        settings: all about the networks' part, instead of ``second_stage``, ``device`` and the defaults; see `unshade.learned`.
         reflections: how a reflected environment is held: ``lights`` are a few values each; ``picture`` is a raster of 24,576
             values over a tree of what is beneath (`unshade.reflections`), where a picture shows one. ``max_values`` is of the tree of
             lights, which stays in the family; what is beneath has the released grammar's leaves, 37 values at most.
     Raises:
         PictureError: the picture cannot be used. TreeError: an argument is out of range. MissingExtraError: the
-            ``paper`` objective without its weights. MissingWeightsError: ``learned`` or ``picture`` without theirs.
+            ``paper`` objective without its weights. MissingWeightsError: ``learned`` or ``picture`` without theirs. UnshadeError: there is
+            no such device.
     """
     if preset not in PRESETS:
         raise TreeError(f"unknown preset {preset!r}{did_you_mean(preset, PRESETS)}")
@@ -179,7 +182,7 @@ def decompose(
         chosen = dataclasses.replace(chosen, effort=dataclasses.replace(chosen.effort, max_values=max_values))
     if search == "depth":
         return Decomposition(_by_depth(sphere, chosen, seed, objective), sphere, seed, preset)
-    main = Search if method == "search" else _learned(sphere, method, seed, second_stage, objective, weights, settings)
+    main = Search if method == "search" else _learned(sphere, method, seed, second_stage, objective, weights, device, settings)
     return Decomposition(_without_gradients(_by_size(sphere, chosen, seed, alternatives, main, uncover)), sphere, seed, preset)
 
 
@@ -279,14 +282,19 @@ def _learned(
     second_stage: SecondStageName,
     objective: Literal["l2", "paper"],
     weights: str | Path | None,
+    device: str,
     settings: Settings | None,
 ) -> Begin:
-    """A method with networks; the search where the hybrid has none. Raises MissingWeightsError, WeightsError."""
+    """A method with networks; the search where the hybrid has none. Raises UnshadeError, MissingWeightsError, WeightsError."""
     from unshade import learned
     from unshade.inference import Networks
 
     proposed = learned.PROPOSED if method == "hybrid" else learned.Settings(second_stage=second_stage, objective=objective)
-    given = settings or proposed
+    given = settings or dataclasses.replace(proposed, device=device)
+    try:
+        torch.empty(1, device=given.device)
+    except (RuntimeError, AssertionError) as error:
+        raise UnshadeError(f"device {given.device}: cannot be used here: {str(error).partition(chr(10))[0]}") from error
     given = dataclasses.replace(given, threads=given.threads or torch.get_num_threads())
     try:
         networks = Networks.load(weights, given.device)

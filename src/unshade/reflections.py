@@ -114,8 +114,10 @@ def uncover(sphere: SphereImage, found: Node, network: ReflectionNet, seed: int)
     if grain(image, valid) > GRAIN:
         return
     plain, share = beneath(image, valid, network)
+    if share < SHOWS:
+        return
     separation = Separation(image, valid, plain, seed)
-    if share < SHOWS or separation.pixels.count < KNOWN:
+    if separation.pixels.count < KNOWN:
         return
     yield None
     pixels = Pixels.of(plain, valid, COARSE_SIZE)

@@ -269,7 +269,7 @@ def _robustness(document: Document) -> Iterator[str]:
     yield (
         "Worse pictures, scored against the clean one, median PSNR (values of the tree): JPEG by quality, noise by its deviation\n"
         "in 1/255, blur by its deviation in pixels of 256, the disc found so many percent of the radius too far to the upper\n"
-        "right, and an input of 32 pixels. Methods that take longest are left out: the hybrid, `search:best`."
+        "right, and an input of 32 pixels. `learned:alone`, `search:draft` and `search:best` are not asked."
     )
     yield ""
     names = [CLEAN, *(f"{kind}:{amount}" for kind, amounts in DAMAGES.items() for amount in amounts)]
