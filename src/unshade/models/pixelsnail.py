@@ -22,10 +22,18 @@ Cache = dict[Any, Tensor]
 """What layers keep between the steps of one sampling run, by layer."""
 
 
+EPSILON = 1e-6
+"""Of the root mean square that features are divided by."""
+
+
 def _norm(x: Tensor, gain: Tensor) -> Tensor:
-    """Root mean square 1 across the channels, dimension 1, at each position alone: so it is causal and the same in a step."""
-    shape = (-1, *(1,) * (x.ndim - 2))
-    return x * torch.rsqrt(x.square().mean(1, keepdim=True) + 1e-6) * gain.view(shape)
+    """Root mean square 1 across the channels, dimension 1 of (B, C, H, W), at each position alone: so it is causal."""
+    return x * torch.rsqrt(x.square().mean(1, keepdim=True) + EPSILON) * gain.view(-1, 1, 1)
+
+
+def _norm_at(x: Tensor, gain: Tensor) -> Tensor:
+    """`_norm` at one position, (N, C)."""
+    return F.rms_norm(x, gain.shape, gain, EPSILON)
 
 
 class CausalConvolution(nn.Module):
@@ -48,26 +56,29 @@ class CausalConvolution(nn.Module):
         return F.conv2d(F.pad(x, (1, self.right, 1, 0)), weight, self.convolution.bias)
 
     def begin(self, cache: Cache, count: int, width: int) -> None:
-        """Keep two rows with zeros around them, which take turns, and the weights in the order of a patch."""
-        weight = self.convolution.weight * self.kept
-        cache[self] = weight.new_zeros(2, width + 1 + self.right, count, weight.shape[1])
-        cache[self, "weight"] = weight.permute(2, 3, 1, 0).reshape(-1, weight.shape[0]).contiguous()
+        """Keep two rows, which take turns, with zeros around them: what a position sees of both lies in one piece, so nothing is copied.
+
+        Which of the two is the row above changes with every row, so the weights are kept in both orders.
+        """
+        weight = (self.convolution.weight * self.kept).permute(2, 3, 1, 0)
+        across, inputs = weight.shape[1:3]
+        cache[self] = weight.new_zeros(count, width + 1 + self.right, 2, inputs)
+        orders = (weight.flip(0), weight)
+        cache[self, "weights"] = torch.stack([order.transpose(0, 1).reshape(2 * across * inputs, -1) for order in orders])
 
     def put(self, cache: Cache, row: int, column: int, x: Tensor) -> None:
         """Remember the input (N, C) at a position."""
-        cache[self][row % 2, column + 1] = x
+        cache[self][:, column + 1, row % 2] = x
 
-    def take(self, cache: Cache, row: int, column: int) -> Tensor:
-        """The output (N, outputs) at a position, from what was put there and before."""
-        above, own = cache[self][(row + 1) % 2], cache[self][row % 2]
-        across = range(column, column + 2 + self.right)
-        patch = torch.cat([line[place] for line in (above, own) for place in across], 1)
-        return torch.addmm(self.convolution.bias, patch, cache[self, "weight"])  # type: ignore[arg-type]
+    def take(self, cache: Cache, row: int, column: int, told: Tensor | None = None) -> Tensor:
+        """The output (N, outputs) at a position, from what was put there and before; ``told``, if given, stands in the bias' place."""
+        patch = cache[self][:, column : column + 2 + self.right].flatten(1)
+        return torch.addmm(self.convolution.bias if told is None else told, patch, cache[self, "weights"][row % 2])  # type: ignore[arg-type]
 
-    def step(self, cache: Cache, row: int, column: int, x: Tensor) -> Tensor:
+    def step(self, cache: Cache, row: int, column: int, x: Tensor, told: Tensor | None = None) -> Tensor:
         """Put, then take."""
         self.put(cache, row, column, x)
-        return self.take(cache, row, column)
+        return self.take(cache, row, column, told)
 
 
 class GatedLayer(nn.Module):
@@ -94,15 +105,14 @@ class GatedLayer(nn.Module):
         """Read the whole condition (H, W, N, D) at once: it is known before the first step."""
         for convolution in (self.first, self.second):
             convolution.begin(cache, condition.shape[2], condition.shape[1])
-        cache[self] = _each(self.told, condition)
+        cache[self] = _each(self.told, condition, self.second.convolution.bias)
 
     def step(self, cache: Cache, row: int, column: int, x: Tensor, aside: Tensor | None = None) -> Tensor:
         """`forward` at one position: x, aside (N, C)."""
-        inner = self.first.step(cache, row, column, F.elu(_norm(x, self.gain)))
+        inner = self.first.step(cache, row, column, F.elu(_norm_at(x, self.gain)))
         if self.aside is not None and aside is not None:
-            inner = inner + self.aside(aside)
-        value, gate = (self.second.step(cache, row, column, F.elu(inner)) + cache[self][row, column]).chunk(2, 1)
-        return x + value * torch.sigmoid(gate)
+            inner = torch.addmm(inner, aside, self.aside.weight.T)
+        return x + F.glu(self.second.step(cache, row, column, F.elu(inner), cache[self][row, column]), 1)
 
 
 class CausalAttention(nn.Module):
@@ -140,7 +150,7 @@ class CausalAttention(nn.Module):
 
     def step(self, cache: Cache, position: int, x: Tensor, places: Tensor) -> Tensor:
         """The look at one position: x (N, C), places (2,) to (N, C)."""
-        x = torch.cat([_norm(x, self.gain), places.expand(len(x), 2)], 1)
+        x = torch.cat([_norm_at(x, self.gain), places.expand(len(x), 2)], 1)
         cache[self, "asked"] = x
         query = self.ask(x).unflatten(1, (self.heads, 1, -1))
         keys, values = cache[self][:, :, :, : position + 1]
@@ -245,7 +255,7 @@ class PixelSNAIL(nn.Module):
                 x = layer.step(cache, row, column, x)  # type: ignore[operator]
             looked = block.attention.step(cache, row * self.size + column, x, places)
             x = block.join.step(cache, row, column, x, looked)
-        return F.elu(_norm(x, self.gain))
+        return F.elu(_norm_at(x, self.gain))
 
     @torch.no_grad()
     def sample_uncached(self, entries: Tensor, condition: Tensor, generator: torch.Generator, temperature: float = 1.0) -> Tensor:
@@ -261,9 +271,10 @@ class PixelSNAIL(nn.Module):
         return torch.cat(found)
 
 
-def _each(convolution: nn.Conv2d, x: Tensor) -> Tensor:
-    """A convolution of 1 x 1 where the channels come last, (..., D) to (..., outputs)."""
-    return F.linear(x, convolution.weight[:, :, 0, 0], convolution.bias)
+def _each(convolution: nn.Conv2d, x: Tensor, more: Tensor | None = None) -> Tensor:
+    """A convolution of 1 x 1 where the channels come last, (..., D) to (..., outputs), with ``more`` added to its bias."""
+    bias = convolution.bias if more is None or convolution.bias is None else convolution.bias + more
+    return F.linear(x, convolution.weight[:, :, 0, 0], bias)
 
 
 def _batches(condition: Tensor) -> tuple[Tensor, ...]:
