@@ -27,7 +27,7 @@ from unshade.models.tokens import LONGEST, VOCABULARY, Cursor, slots_of, token_o
 from unshade.nodes import Tree, leaf, multiply, screen
 from unshade.pictures import Disc, SphereImage
 from unshade.render import render
-from unshade.sphere import disc_mask, sphere_normals
+from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals
 from unshade.synthesis import Style, trees
 from unshade.train import Run
 
@@ -177,10 +177,19 @@ def test_all_are_about_as_large_as_the_learned_method(name: str) -> None:
 
 @pytest.mark.parametrize("name", [*weights.BASELINES])
 def test_the_trained_baselines_see_something(name: str) -> None:
-    root = multiply(leaf("albedo", color=(0.8, 0.3, 0.2)), leaf("diffuse", direction=(0.3, 0.5, 0.8)))
-    picture = render(root, sphere_normals(64))
-    found = baselines.Baseline.load(name).tree(SphereImage(picture, disc_mask(64), Disc(32.0, 32.0, 32.0, 1.0)))
-    assert psnr(render(found, sphere_normals(64)), picture, disc_mask(64)) > psnr(torch.zeros_like(picture), picture, disc_mask(64))
+    """Of paint with form more than the best single colour, the mean over the scored disc, would show."""
+    baseline, normals = baselines.Baseline.load(name), sphere_normals(64)
+    gains = []
+    for color, kind, direction in (
+        ((0.8, 0.3, 0.2), "diffuse", (0.3, 0.5, 0.8)),
+        ((0.2, 0.3, 0.8), "diffuse", (-0.6, 0.5, 0.5)),
+        ((0.2, 0.6, 0.3), "toon_diffuse", (-0.6, 0.5, 0.5)),
+    ):
+        seen = picture(Tree(multiply(leaf("albedo", color=color), leaf(kind, direction=direction))))
+        mean = seen.image[:, disc_mask(64, SCORED_RADIUS)[0]].mean(1)
+        one_color = mean[:, None, None].expand_as(seen.image)
+        gains.append(psnr(render(baseline.tree(seen), normals), seen.image) - psnr(one_color, seen.image))
+    assert sum(gains) / len(gains) > 1.5, gains
 
 
 def test_the_configuration_is_that_of_the_weights() -> None:

@@ -73,6 +73,14 @@ def test_cmyk_is_converted(examples: Path, tmp_path: Path, capfd: pytest.Capture
     assert records(out)[0]["psnr"] > 20
 
 
+def test_a_hybrid_without_networks_says_how_to_train_them(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """And not that a search would need none: a search is what it did."""
+    PILImage.new("RGB", (64, 64), (90, 60, 40)).save(tmp_path / "flat.png")
+    words = ["decompose", str(tmp_path / "flat.png"), "--artifacts", "none", "--preset", "draft", "--weights", str(tmp_path)]
+    assert cli.run([*words, "--method", "hybrid"]) == 0
+    assert "no such weights; train them with: unshade train all\n" in capfd.readouterr().err
+
+
 @pytest.mark.slow
 def test_the_tree_does_not_depend_on_the_workers_or_the_batch(examples: Path, tmp_path: Path) -> None:
     with program(

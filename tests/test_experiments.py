@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 from rich.console import Console
 
+from unshade import baselines
 from unshade.bench.datasets import Case
 from unshade.cli import run as command
 from unshade.components import Component
@@ -29,6 +31,7 @@ from unshade.models import weights
 from unshade.models.config import find
 from unshade.nodes import Operator, Tree, leaf, mix, multiply, screen
 from unshade.pictures import write_picture
+from unshade.presets import PRESETS
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
 
@@ -96,8 +99,9 @@ def test_from_data_to_the_page(tmp_path: Path, data: Path, folder: Path) -> None
     assert {row["dataset"] for row in ran.documents["decomposition"]["summary"]} == {"realistic", "toon", "pbr", "wild"}
     staged = [row["stages"]["second_stage_share"] for row in ran.documents["ablation"]["summary"]]
     assert len(staged) == 6
+    steps = ran.documents["anytime"]["rows"][0]["anytime"]
     curve = ran.documents["anytime"]["summary"][0]["curve"]
-    assert curve[-1]["median"] >= curve[0]["median"]
+    assert curve[-1] == {"at": parts.SECONDS[-1], "median": max(step[1] for step in steps), "p10": max(step[1] for step in steps)}
 
 
 def test_what_is_done_is_not_done_again(tmp_path: Path, data: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,6 +184,9 @@ def test_names_are_the_commands() -> None:
     assert cli_experiments.PARTS == PARTS == tuple(parts.PARTS)
     for method in METHODS:
         methods.name_of(method)
+    told = cli_experiments.experiments.help or ""
+    for word in (*baselines.NAMES, *methods.VARIANTS, *PRESETS, methods.FIT, methods.REFLECTIONS):
+        assert re.search(rf"(?<!\w){re.escape(word)}\b", told), f"unshade experiments -h does not mention {word}"
 
 
 @pytest.mark.parametrize("what", ALL)
@@ -252,6 +259,21 @@ def test_test_trees_do_not_depend_on_how_many_are_asked_for() -> None:
     case = Case("toon", "0003", None, 3)
     assert subjects.load(case, 0).truth == subjects.load(subjects.find_cases("toon", Path("none"), 5)[3], 0).truth
     assert subjects.pool("pool-toon", 2, 0) == subjects.pool("pool-toon", 5, 0)[:2]
+
+
+def test_a_curve_is_the_median_of_the_best_so_far() -> None:
+    """A tree that is worse than one before lowers nothing, and a limit within which some picture has none is left out."""
+    rows = [
+        {"anytime": [[0.15, 20.0, 5], [0.4, 30.0, 9], [3.0, 26.0, 7]]},
+        {"anytime": [[0.05, 10.0, 3], [1.5, 40.0, 9]]},
+        {"anytime": [[0.18, 24.0, 4]]},
+    ]
+    assert parts._over(rows, "anytime", (0.1, 0.2, 0.5, 2.0, 5.0)) == [
+        {"at": 0.2, "median": 20.0, "p10": 12.0},
+        {"at": 0.5, "median": 24.0, "p10": 12.8},
+        {"at": 2.0, "median": 30.0, "p10": 25.2},
+        {"at": 5.0, "median": 30.0, "p10": 25.2},
+    ]
 
 
 def test_figures() -> None:

@@ -265,6 +265,8 @@ def test_what_a_run_leaves(tmp_path: Path) -> None:
     assert any(name.startswith("vqvae/tensorboard/events") for name in names)
     card = weights.read_card(weights.file_of("vqvae", run.weights))
     assert (card["steps"], card["examples"], card["config"]) == (2, 8, "tiny")
+    # Not `auto`, which says nothing about what was computed.
+    assert run.precision == "auto" and card["precision"] in ("float32", "bfloat16")
 
 
 def test_a_run_changes_nothing_around_it(tmp_path: Path) -> None:
@@ -300,8 +302,11 @@ def test_precision_is_known() -> None:
 
 
 def test_mixed_precision_trains(tmp_path: Path) -> None:
-    progress = finish(run_of(tmp_path, steps=4, precision="bfloat16"))
-    assert all(torch.isfinite(torch.tensor(one.loss)) for one in progress)
+    """Its losses are rounded more coarsely than those of float32, and lead to the same place."""
+    runs = {precision: run_of(tmp_path / precision, steps=4, precision=precision) for precision in ("float32", "bfloat16")}
+    losses = {precision: [progress.loss for progress in finish(run)] for precision, run in runs.items()}
+    assert all(mixed != exact for mixed, exact in zip(losses["bfloat16"], losses["float32"], strict=True))
+    assert losses["bfloat16"] == pytest.approx(losses["float32"], rel=0.02)
 
 
 def test_the_command_trains_all(tmp_path: Path) -> None:
@@ -311,6 +316,7 @@ def test_the_command_trains_all(tmp_path: Path) -> None:
     assert [report["task"] for report in reports] == list(MODELS)
     page = (tmp_path / "weights" / "model-card.md").read_text(encoding="utf-8")
     assert all(title in page for title in model_card.TITLES.values())
+    assert "one run of `unshade train`" in page and "that ship" not in page and "baselines" not in page
     # Drawings reflect nothing, so two figures of one model are of realistic trees alone.
     assert page.count("–") == 2 == page.split("## Reflection")[1].count("–")
     assert weights.available(tmp_path / "weights")

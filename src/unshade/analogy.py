@@ -157,7 +157,8 @@ def analogy(
     goal, valid = _picture(read.pop("AB"))
     before, counts = _picture(read["A"])
     if (still := psnr(goal, before, counts & valid)) >= VISIBLE:
-        raise TreeError(f"nothing was moved: AB is A, {min(still, 200.0):.1f} dB apart, so nothing can be understood from it")
+        near = "is identical to A" if math.isinf(still) else f"looks like A, {still:.1f} dB apart"
+        raise TreeError(f"nothing was moved: AB {near}, so nothing can be understood from it")
     held = _held() if any(not isinstance(source, Tree) for source in read.values()) else None
     seen = {}
     for name, source in read.items():

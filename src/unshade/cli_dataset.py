@@ -21,8 +21,8 @@ def dataset() -> None:
 
     \b
     Examples:
-      unshade dataset make realistic -o data/realistic --trees 20000
-      unshade dataset check data/realistic
+      unshade dataset make both -o data --trees 20000
+      unshade dataset check data
     """
 
 
@@ -46,9 +46,11 @@ def make(output: Path, workers: int | None, quiet: bool, as_json: bool, **option
     manifest.json with counts and checksums. A call that was cut short goes on where it stopped, and a larger N adds to what
     is there. What is there is compared with its checksums, and a shard that was changed is written anew.
 
+    `unshade train --shards DIR` learns from DIR where its --style is STYLE, and both is its default.
+
     \b
     Examples:
-      unshade dataset make realistic -o data/realistic --trees 20000
+      unshade dataset make both -o data --trees 20000
       unshade dataset make toon -o data/toon-test --split test --trees 500 --size 128
     """
     from unshade import batch, synthesis_shards

@@ -27,7 +27,7 @@ class ExperimentsError(UnshadeError):
     "methods",
     multiple=True,
     metavar="NAME",
-    help="cnn, lstm, transformer (and NAME+fit), learned, search:PRESET, hybrid:PRESET; may be repeated. Default: all.",
+    help="One of those above; may be repeated. Default: the baselines, learned:alone, learned, search with each preset, hybrid.",
 )
 @click.option("--limit", type=click.IntRange(1), metavar="N", help="Pictures of each set, and analogies of each component.")
 @click.option("--resume/--fresh", default=True, help="Keep what an earlier run has measured (the default), or measure again.")
@@ -74,6 +74,14 @@ def experiments(
     robustness spoils the pictures and looks at size, anytime looks at the trees on the way, wild shows what has no known tree. The
     JSON behind the page goes to DIR/benchmarks/results/experiments. Data and weights that are not there are skipped by name, and so
     is the ablation where learned is not among the methods. It can be interrupted and goes on where it was.
+
+    \b
+    Methods:
+      cnn, lstm, transformer         the baselines; with +fit their trees are fitted
+      learned                        the learned method with all that is ours
+      learned:VARIANT                base, samples, second, overall, full (learned itself), alone or depth
+      search:PRESET, hybrid:PRESET   draft, balanced or best; without a preset, balanced
+      learned, search and hybrid     with +reflections hold a reflected environment as a picture
 
     \b
     Examples:

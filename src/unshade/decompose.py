@@ -301,7 +301,7 @@ def _learned(
     except MissingWeightsError as error:
         if method == "learned":
             raise
-        return partial(learned.Unproposed, why=str(error))
+        return partial(learned.Unproposed, why=error.reason)
     main = learned.Learned if method == "learned" else learned.Hybrid
     return lambda samples, effort: main(sphere.image, sphere.valid, samples, effort, networks, given, seed)
 

@@ -56,7 +56,14 @@ class MissingExtraError(UnshadeError):
 
 
 class MissingWeightsError(MissingExtraError):
-    """The trained weights of a network are not where they are looked for."""
+    """The trained weights of a network are not where they are looked for.
+
+    ``reason`` is the message without ``instead``, what can be had without them.
+    """
+
+    def __init__(self, reason: str, instead: str = "") -> None:
+        super().__init__(f"{reason} ({instead})" if instead else reason)
+        self.reason = reason
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

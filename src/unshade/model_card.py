@@ -58,29 +58,36 @@ STYLES = ("realistic", "toon")
 CARD = "model-card.md"
 """Name of the page, beside the weights."""
 
-HEAD = """# Model card
-
+SHIPPED = """\
 The weights that ship with `unshade`, written by `unshade train all`. The learned method reads all but `reflection`, which tells a search
 what a picture reflects. This page is made from what stands in the files (`scripts/model_card.py`). Safetensors, parameters in half
 precision; how they were trained stands in `docs/training.md` of the repository. The baselines, which nothing but the experiments reads
 (`docs/experiments.md`), are not in the package; they lie in `benchmarks/weights` of the repository.
+"""
 
+OF_A_RUN = """\
+The weights of one run of `unshade train`, which lie beside this page; `unshade decompose --weights` takes the folder. The learned
+method reads `vqvae`, `prior` and `heads`; `reflection` tells a search what a picture reflects. This page is made from what stands in
+the files. Safetensors, parameters in half precision.
+"""
+
+DISTRIBUTION = """\
 Made for node images of shade trees: synthetic shaded spheres of the released grammar and wider ones, black outside the disc. Figures
 are of nodes from the test half of the data, whose colours, directions, masks and environment maps occur in no training tree. Photographs
 of real spheres are another distribution, and nothing here says how well it goes there.
 """
 
 
-def page(*folders: Path) -> str:
+def page(*folders: Path, origin: str = SHIPPED) -> str:
     """The card of all weights in some folders, as Markdown. Raises MissingWeightsError, WeightsError."""
     sections = [(name, folder) for folder in folders for name in TITLES | BASELINES if weights.file_of(name, folder).is_file()]
-    return HEAD + "".join(_section(name, folder) for name, folder in sections)
+    return f"# Model card\n\n{origin}\n{DISTRIBUTION}" + "".join(_section(name, folder) for name, folder in sections)
 
 
 def write_card(folder: Path) -> Path:
-    """Put the page beside the weights. Raises OutputError."""
+    """Put the page about a run beside its weights. Raises OutputError."""
     path = folder / CARD
-    write_whole(path, page(folder).encode())
+    write_whole(path, page(folder, origin=OF_A_RUN).encode())
     return path
 
 

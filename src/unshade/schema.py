@@ -6,7 +6,6 @@ one entry a lobe, how large and how deep a tree may be.
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from unshade.blend import BLENDS
@@ -78,11 +77,6 @@ def tree_schema() -> dict[str, Any]:
             **{name: _leaf(kind) for name, kind in KINDS.items()},
         },
     }
-
-
-def schema_text() -> str:
-    """`tree_schema` as the text of ``tree.schema.json``."""
-    return json.dumps(tree_schema(), indent=1) + "\n"
 
 
 def _ref(name: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import os
 import platform
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,11 +116,12 @@ def train(run: Run, place: processes.Place | None = None) -> Iterator[Progress]:
     with contextlib.nullcontext(place) if place else processes.place() as place:
         shards = shards_of(run)
         precision = processes.precision(run.precision, place.device)
+        run = replace(run, precision=str(precision).removeprefix("torch."))
         task = TASKS[run.task](run.config, run.weights, place.device)
         with processes.seeded(run.seed, 0):
             model = task.build().to(place.device)
         optimizer = torch.optim.AdamW(model.parameters(), lr=training.learning_rate, betas=(0.9, 0.99), weight_decay=training.weight_decay)
-        identity = Identity(run.task, run.config, run.style, run.seed, str(precision).removeprefix("torch."), place.processes, shards)
+        identity = Identity(run.task, run.config, run.style, run.seed, run.precision, place.processes, shards)
         position, changes = Position(), list[str]()
         if run.state.is_file():
             position, changes = checkpoint.resume(run.state, model, optimizer, identity)

@@ -46,8 +46,8 @@ BASELINES: dict[str, Callable[[Config], nn.Module]] = {"cnn": CNNBaseline, "lstm
 """What it is compared with."""
 
 WITHOUT = {
-    **dict.fromkeys(MODELS, " (`unshade decompose --method search` needs none)"),
-    **dict.fromkeys(SEARCH, " (`unshade decompose --reflections lights` needs none)"),
+    **dict.fromkeys(MODELS, "`unshade decompose --method search` needs none"),
+    **dict.fromkeys(SEARCH, "`unshade decompose --reflections lights` needs none"),
 }
 """What can be had without some weights, for whoever looks for them in vain."""
 
@@ -101,7 +101,7 @@ def _training(name: str) -> str:
 
 def _header(path: Path) -> dict[str, str]:
     if not path.is_file():
-        raise MissingWeightsError(f"{path}: no such weights; train them with: {_training(path.stem)}{WITHOUT.get(path.stem, '')}")
+        raise MissingWeightsError(f"{path}: no such weights; train them with: {_training(path.stem)}", WITHOUT.get(path.stem, ""))
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
