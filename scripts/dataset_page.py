@@ -8,25 +8,27 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image as PillowImage
+from PIL import Image as PILImage
 
 from unshade import environments
-from unshade.base_nodes import BASES, Base, Range
+from unshade.base_nodes import BASES, SPLITS, Base, Range
+from unshade.experiments.sheets import Cell, Table, sheet
 from unshade.forest import CODES, Forest, Plant
 from unshade.made_environments import MADE_SHARE
 from unshade.nodes import KINDS
 from unshade.reflection_data import ENVIRONMENT_SHARE, UNALTERED_SHARE, ReflectionBatches
 from unshade.reflection_data import WIDE_SHARE as REAL_SHARE
 from unshade.sphere import disc_mask, sphere_normals
-from unshade.synthesis import GROVE, OPERATORS, TYPES, WIDE_SHARE, Batch, examples, plants
+from unshade.synthesis import GROVE, OPERATORS, TYPES, WIDE_SHARE, examples, plants
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "dataset.md"
 FOLDER = PAGE.parent / "dataset"
-SIZE, COLUMNS, ROWS = 64, 12, 4
+SIZE, COLUMNS, ROWS = 128, 12, 4
 COUNTED = 16
 """Groves of each style that are counted."""
 
@@ -96,53 +98,57 @@ ten toon trees do at once.
 """
 
 
-def image(shaded: torch.Tensor) -> np.ndarray:
-    """(3, H, W) in [0, 1] as 8-bit pixels."""
-    return (shaded.permute(1, 2, 0).numpy() * 255.0).round().clip(0, 255).astype(np.uint8)
-
-
-def grid(pictures: torch.Tensor, columns: int) -> np.ndarray:
-    """(N, 3, S, S) in rows of ``columns``."""
-    rows, size = len(pictures) // columns, pictures.shape[-1]
-    tiled = pictures[: rows * columns].view(rows, columns, 3, size, size).permute(2, 0, 3, 1, 4)
-    return image(tiled.reshape(3, rows * size, columns * size))
+def grid(cells: Sequence[Cell], heads: Sequence[Sequence[str]]) -> Table:
+    """Cells in lines that are as long as there are titles."""
+    columns = sum(map(len, heads))
+    return Table(heads, [cells[start : start + columns] for start in range(0, len(cells), columns)])
 
 
 def grown(style: str, split: str, groves: int) -> list[Plant]:
     return [plant for grove in range(groves) for plant in plants(style, split, 0, grove)]  # type: ignore[arg-type]
 
 
-def roots(style: str) -> np.ndarray:
+def roots(style: str) -> Table:
     """The pictures of whole trees."""
     made, owners = examples(grown(style, "test", -(-COLUMNS * ROWS // GROVE)), SIZE)
-    last = torch.tensor([int((owners == tree).nonzero()[-1]) for tree in range(COLUMNS * ROWS)])
-    return grid(made.parent[last], COLUMNS)
+    last = [int((owners == tree).nonzero()[-1]) for tree in range(COLUMNS * ROWS)]
+    return grid([(made.parent[row], "") for row in last], [[""] * COLUMNS])
 
 
-def shown_reflections() -> np.ndarray:
-    """Pictures above what they are without their environment, and the environments."""
+def shown_reflections() -> Table:
+    """Pictures, what they are without their environment, and the environments."""
     batch = ReflectionBatches("realistic", "train", SIZE, COLUMNS, 0)[0]
-    return grid(torch.cat([batch.pictures, batch.plain, batch.environments]), COLUMNS)
+    cells: list[Cell] = []
+    for picture, plain, environment in zip(batch.pictures, batch.plain, batch.environments, strict=True):
+        cells += [(picture, ""), (plain, ""), (environment if environment.any() else None, "")]
+    return grid(cells, [["picture", "without", "environment"]] * 4)
 
 
-def shown_examples() -> np.ndarray:
+def shown_examples() -> Table:
     """Six of each operator."""
     made = examples([*grown("realistic", "test", 1), *grown("toon", "test", 1)], SIZE)[0]
-    rows = torch.cat([(made.operator == index).nonzero()[:, 0][5::9][:6] for index in range(len(OPERATORS))])
-    chosen: Batch = made[rows]
-    return grid(torch.stack([chosen.parent, chosen.left, chosen.right, chosen.mask.expand(-1, 3, -1, -1)], 1).flatten(0, 1), COLUMNS)
+    cells: list[Cell] = []
+    for index, operator in enumerate(OPERATORS):
+        for row in (made.operator == index).nonzero()[:, 0][5::9][:6].tolist():
+            mask = made.mask[row].expand(3, -1, -1) if operator == "mix" else None
+            cells += [(made.parent[row], operator), (made.left[row], ""), (made.right[row], ""), (mask, "")]
+    return grid(cells, [["parent", "left", "right", "mask"]] * 3)
 
 
-def shown_environments() -> np.ndarray:
+def shown_environments() -> Table:
     """Mirrored by a sphere: the training half, then the test half; as it is, and blurred twice."""
     normals, inside = sphere_normals(SIZE), disc_mask(SIZE)
-    made = []
-    for sharpness in environments.SHARPNESSES:
-        for split in ("train", "test"):
-            for (_, exposure, blur), panorama in zip(environments.versions(split), environments.panoramas(split), strict=True):
-                if (exposure, blur) == (environments.EXPOSURES[2], sharpness):
-                    made.append(KINDS["environment_map"].formula(normals, panorama, torch.zeros(3)) * inside)
-    return grid(torch.stack(made), len(made) // len(environments.SHARPNESSES))
+    lines: list[list[Cell]] = []
+    for sharpness, told in zip(environments.SHARPNESSES, ("as it is", "blurred", "blurred\nmore"), strict=True):
+        shown = [
+            KINDS["environment_map"].formula(normals, panorama, torch.zeros(3)) * inside
+            for split in SPLITS
+            for (_, exposure, blur), panorama in zip(environments.versions(split), environments.panoramas(split), strict=True)
+            if (exposure, blur) == (environments.EXPOSURES[2], sharpness)
+        ]
+        lines.append([(image, "" if number else told) for number, image in enumerate(shown)])
+    halves_ = zip(SPLITS, ("training\nhalf", "test\nhalf"), strict=True)
+    return Table([[title, *[""] * (len(environments.names(split)) - 1)] for split, title in halves_], lines)
 
 
 def written(numbers: Range) -> str:
@@ -275,14 +281,15 @@ their environment, and the environments:
 """
 
 
-def pictures() -> dict[str, np.ndarray]:
-    return {
+def pictures() -> dict[str, PILImage.Image]:
+    tables = {
         "realistic.png": roots("realistic"),
         "toon.png": roots("toon"),
         "examples.png": shown_examples(),
         "environments.png": shown_environments(),
         "reflections.png": shown_reflections(),
     }
+    return {name: sheet(table) for name, table in tables.items()}
 
 
 def same(kept: np.ndarray, made: np.ndarray) -> bool:
@@ -295,7 +302,7 @@ def stale() -> list[str]:
     found = [] if PAGE.is_file() and PAGE.read_text(encoding="utf-8") == page() else [PAGE.name]
     for name, made in pictures().items():
         path = FOLDER / name
-        if not path.is_file() or not same(np.asarray(PillowImage.open(path)), made):
+        if not path.is_file() or not same(np.asarray(PILImage.open(path)), np.asarray(made)):
             found.append(f"dataset/{name}")
     return found
 
@@ -307,8 +314,8 @@ def main() -> None:
             sys.exit(f"out of date: {', '.join(found)}; run scripts/dataset_page.py")
         return
     FOLDER.mkdir(exist_ok=True)
-    for name, pixels in pictures().items():
-        PillowImage.fromarray(pixels).save(FOLDER / name, optimize=True)
+    for name, picture in pictures().items():
+        picture.save(FOLDER / name, optimize=True)
     PAGE.write_text(page(), encoding="utf-8", newline="\n")
     print(f"{PAGE.name} and its pictures")
 
