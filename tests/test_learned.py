@@ -18,11 +18,12 @@ import torch
 
 from unshade import batch, decoded, inference, learned, search_depth, second_stage, synthesis
 from unshade.cli import run as run_command
+from unshade.criterion import Terms, criterion
 from unshade.decompose import Result, decompose, fit
 from unshade.errors import MissingWeightsError, TreeError, UnshadeError
 from unshade.fit.pixels import Pixels
 from unshade.grammar import same_structure
-from unshade.inference import Inference, Networks, Part, Pool, Round, Terms, criterion, infer, node_image
+from unshade.inference import Inference, Networks, Part, Pool, Round, infer, node_image
 from unshade.models import weights
 from unshade.models.config import find
 from unshade.models.vqvae import Codes
@@ -34,7 +35,7 @@ from unshade.render import evaluate, render
 from unshade.sphere import disc_mask, sphere_normals
 
 SIZE = 32
-SETTINGS = Inference(samples=3, stop=10.0, depth=2)
+SETTINGS = Inference(samples=3, stop=10.0, depth=2, hidden=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +140,21 @@ def test_no_more_nodes_are_drawn_for_than_allowed(networks: Networks, trees: int
     assert 1 <= [part.state for part in best.parts].count("split") <= draws and best.left_over
 
 
+def test_what_hardly_shows_is_one_colour_and_is_not_drawn_for(networks: Networks) -> None:
+    every = pools(endless(networks), dataclasses.replace(SETTINGS, depth=3))[-1]
+    none = pools(endless(networks), dataclasses.replace(SETTINGS, depth=3, hidden=10.0))[-1]
+    assert every.drawn > none.drawn == 1
+    assert [(part.state, part.kind) for part in none.pools[0].parts[1:]] == [("leaf", "albedo")] * 2
+
+
+def test_what_shows_most_is_drawn_for_first(networks: Networks) -> None:
+    settings = dataclasses.replace(SETTINGS, depth=9, trees=1, draws=2, hidden=1e-6)
+    (pool,) = pools(endless(networks), settings)[-1].pools
+    split = [part for part in pool.parts[1:3] if part.state == "split"]
+    left_over = [part for part in pool.parts[1:3] if part.state == "left over"]
+    assert [part.cause for part in left_over] == ["draws"] and split[0].shown >= left_over[0].shown
+
+
 def test_more_samples_never_choose_a_worse_one(networks: Networks) -> None:
     settings = dataclasses.replace(SETTINGS, samples=8)
     image = node_image(picture(SIMPLE), disc_mask(96), 16)
@@ -166,7 +182,8 @@ def test_several_pools_differ_and_the_best_comes_first(networks: Networks) -> No
 def terms(parent: torch.Tensor, left: torch.Tensor, right: torch.Tensor, operator: str, mask: torch.Tensor | None = None) -> Terms:
     masks = torch.zeros(1, 1, SIZE, SIZE) if mask is None else mask[None]
     number = torch.tensor([synthesis.OPERATORS.index(operator)])
-    return criterion(parent[None], parent[None], left[None], right[None], number, masks, Inference())[0]
+    children = left[None], right[None]
+    return criterion(parent[None], parent[None], children, children, number, masks, (0.02, 0.02, 0.02))[0]
 
 
 def test_the_criterion_of_a_right_decomposition_is_nothing() -> None:
@@ -396,10 +413,10 @@ def test_looking_at_a_node_in_its_place_mends_what_was_decoded_badly(monkeypatch
 
     oracle: Any = Blurred(PAINTED)
     monkeypatch.setattr(Networks, "load", lambda *_: oracle)
-    only = Inference(samples=1, depth=1, stop=10.0, trees=1)
+    only = Inference(samples=1, depth=1, stop=10.0, trees=1, remainders=False)
     found = [
         decompose(
-            picture(PAINTED), method="learned", preset="draft", settings=learned.Settings(only, in_place=in_place, overall=False)
+            picture(PAINTED), method="learned", preset="balanced", settings=learned.Settings(only, in_place=in_place, overall=False)
         ).result()
         for in_place in (False, True)
     ]

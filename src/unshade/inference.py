@@ -30,29 +30,23 @@ import dataclasses
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Literal, cast
 
 import torch
 import torch.nn.functional as F
 
-from unshade.blend import BLENDS
+from unshade.criterion import Terms, criterion
 from unshade.models import weights
 from unshade.models.config import Config
 from unshade.models.heads import Heads
 from unshade.models.prior import Priors
 from unshade.models.vqvae import VQVAE, Codes
+from unshade.remainders import completed, contrast, gains
 from unshade.sphere import disc_mask
 from unshade.synthesis import OPERATORS, TYPES
 from unshade.types import Image, Mask
-
-SEEN = 0.02
-"""Root mean square difference from which on two decoded pictures are visibly different. Leaves of our trees change a picture by
-0.008 at least."""
-
-LEAST = 1e-3
-"""Smallest difference whose logarithm is taken."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +76,10 @@ class Inference:
     """Pools kept side by side; the paper keeps one."""
     choices: int = 3
     """Decompositions of a node that pools may differ in."""
+    remainders: bool = True
+    """Give a child that is to be decomposed what its sibling leaves of the parent (`remainders`), not what was decoded for it alone."""
+    hidden: float = 0.01
+    """A part that changes the picture by less than this, root mean square, against one colour is one colour."""
 
 
 Cause = Literal["loss", "depth", "nodes", "draws"]
@@ -128,18 +126,6 @@ def _loaded(folder: Path, ages: tuple[int, ...], device: str) -> Networks:
     return Networks(cast(VQVAE, vqvae.model), cast(Priors, priors.model), cast(Heads, heads.model), vqvae.config)
 
 
-@dataclass(frozen=True)
-class Terms:
-    """The criterion of one sample."""
-
-    recon: float
-    similar: float
-    blank: float
-    white: float
-    select: float
-    """All of them, weighted."""
-
-
 @dataclass(frozen=True, eq=False)
 class Part:
     """A node of a pool."""
@@ -162,6 +148,13 @@ class Part:
     """(1, S, S), of a mix."""
     cause: Cause | None = None
     """Of a part that is left over."""
+    gain: Image | None = None
+    """(3, S, S), how much of it shows in the picture; None is all of it."""
+
+    @cached_property
+    def shown(self) -> float:
+        """`remainders.contrast` in the picture."""
+        return float(contrast(self.image, torch.ones_like(self.image) if self.gain is None else self.gain))
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,6 +259,8 @@ def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> I
     while any(pool.open for pool in pools):
         # Pools share their upper parts, which are drawn for once.
         parts = list({id(pool.parts[place]): pool.parts[place] for pool in pools for place in pool.open}.values())
+        if settings.hidden:
+            parts.sort(key=lambda part: -part.shown)
         parts = parts[: settings.draws - drawn]
         if not parts:
             yield Round(tuple(_left_over(pool, pool.open, "draws") for pool in pools), drawn)
@@ -308,60 +303,44 @@ def _splits(parts: Sequence[Part], networks: Networks, settings: Inference, gene
     operators = networks.heads.operator(parents, left, right).argmax(1)
     masks = torch.sigmoid(networks.heads.mask(parents, left, right))
     kinds = [networks.heads.types(child).argmax(1).tolist() for child in (left, right)]
-    terms = criterion(parents, shown, left, right, operators, masks, settings)
+    names = [OPERATORS[int(number)] for number in operators]
+    known = [mask if name == "mix" else None for name, mask in zip(names, masks, strict=True)]
+    types = [(TYPES[first], TYPES[second]) for first, second in zip(*kinds, strict=True)]
+    whole = left, right
+    if settings.remainders:
+        pairs = (completed(*row) for row in zip(parents, names, zip(left, right, strict=True), known, types, strict=True))
+        whole = cast("tuple[Image, Image]", tuple(torch.stack(side) for side in zip(*pairs, strict=True)))
+        shown = parents
+        left, right = (networks.vqvae.decode(networks.vqvae.encode(side)) for side in whole)
+    terms = criterion(parents, shown, (left, right), whole, operators, masks, (settings.similar, settings.blank, settings.white))
     found: list[list[_Split]] = []
     for number, part in enumerate(parts):
         rows = range(number * count, (number + 1) * count)
         ways: dict[tuple[str, ...], _Split] = {}
         for row in sorted(rows, key=lambda row: (terms[row].select, row)):
-            operator = OPERATORS[int(operators[row])]
-            children = tuple(
-                _child(images[row], _one(codes, row), TYPES[kind[row]], part.depth + 1, settings)
-                for images, codes, kind in zip((left, right), drawn, kinds, strict=True)
+            if (names[row], *types[row]) in ways:
+                continue
+            children = [side[row] for side in whole]
+            shares = gains(names[row], children, known[row])
+            made = tuple(
+                _child(part, image, share, kind, networks.vqvae.encode(image[None]) if settings.remainders else _one(codes, row), settings)
+                for image, share, kind, codes in zip(children, shares, types[row], drawn, strict=True)
             )
-            way = _Split(terms[row], operator, masks[row] if operator == "mix" else None, cast("tuple[Part, Part]", children))
-            ways.setdefault(way.kind, way)
+            ways[names[row], *types[row]] = _Split(terms[row], names[row], known[row], cast("tuple[Part, Part]", made))
             if len(ways) == settings.choices:
                 break
         found.append(list(ways.values()))
     return found
 
 
-def _child(image: Image, codes: Codes, kind: str, depth: int, settings: Inference) -> Part:
-    part = Part(image, codes, kind, "open" if kind == "operator" else "leaf", depth)
-    return dataclasses.replace(part, state="left over", cause="depth") if part.state == "open" and depth >= settings.depth else part
-
-
-def criterion(
-    parents: Image, shown: Image, left: Image, right: Image, operators: torch.Tensor, masks: Mask, settings: Inference
-) -> list[Terms]:
-    """L_select of B samples and its terms.
-
-    Args:
-        parents, left, right: (B, 3, S, S). shown: the parents as they come out of their codes.
-        operators: (B,), index of `OPERATORS`. masks: (B, 1, S, S) in [0, 1].
-    """
-    disc = disc_mask(parents.shape[-1], device=parents.device)
-    rebuilt = torch.stack([BLENDS[name].apply(left, right, *([masks] if name == "mix" else [])) for name in OPERATORS])
-    rebuilt = rebuilt[operators, torch.arange(len(operators), device=operators.device)]
-    recon = _distance(parents, rebuilt, disc)
-    mixed = operators == OPERATORS.index("mix")
-
-    def near(other: Image, ignored: torch.Tensor | None = None) -> torch.Tensor:
-        least = torch.minimum(_distance(left, other, disc), _distance(right, other, disc))
-        found = -(least.clamp(LEAST, SEEN) / SEEN).log()
-        return found if ignored is None else found.masked_fill(ignored, 0.0)
-
-    similar = near(shown)
-    blank, white = near(torch.zeros_like(parents), mixed), near(disc.to(parents).expand_as(parents), mixed)
-    select = recon + settings.similar * similar + settings.blank * blank + settings.white * white
-    columns = (column.tolist() for column in (recon, similar, blank, white, select))
-    return [Terms(*row) for row in zip(*columns, strict=True)]
-
-
-def _distance(a: Image, b: Image, disc: Mask) -> torch.Tensor:
-    """Root mean square difference inside the disc, (B,)."""
-    return ((a - b).square().mean(1) * disc).sum((1, 2)).div(disc.sum()).sqrt()
+def _child(parent: Part, image: Image, share: Image, kind: str, codes: Codes, settings: Inference) -> Part:
+    gain, depth = share if parent.gain is None else share * parent.gain, parent.depth + 1
+    if kind != "operator":
+        return Part(image, codes, kind, "leaf", depth, gain=gain)
+    if float(contrast(image, gain)) < settings.hidden:
+        return Part(image, codes, "albedo", "leaf", depth, gain=gain)
+    part = Part(image, codes, kind, "open", depth, gain=gain)
+    return dataclasses.replace(part, state="left over", cause="depth") if depth >= settings.depth else part
 
 
 def _grown(pool: Pool, splits: dict[int, list[_Split]], settings: Inference) -> list[Pool]:

@@ -1,6 +1,6 @@
 """The second stage of the learned method: the nodes that the networks could not decompose.
 
-A node is decomposed twice. First its picture as it was decoded, which is blurred and a little wrong, so that every node has some
+A node is decomposed twice. First its picture as the first stage left it, 64 pixels wide and a little wrong, so that every node has some
 tree. Then, beyond the paper, what it has to show *in its place*: the operators above it are undone with the siblings as they are by
 then, which says at the pixels of the real picture what is missing there. The better of both stays.
 """
@@ -31,8 +31,8 @@ from unshade.search import Search
 from unshade.sphere import disc_mask
 from unshade.types import Image, Mask
 
-NODE_EFFORT = Effort(24, price=0.02, beam=0, trials=3, rounds=0, sweeps=0, polish_steps=10)
-"""By size on one node: its picture is decoded from codes, or has what siblings lack, so small gains are noise."""
+NODE_EFFORT = Effort(32, price=0.01, beam=0, trials=3, rounds=0, sweeps=0, polish_steps=10)
+"""By size on one node: it has what its siblings lack, so the smallest gains are noise."""
 
 ALBEDO = 3
 """Values of one colour."""
