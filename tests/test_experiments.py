@@ -17,7 +17,7 @@ from unshade.bench.datasets import Case
 from unshade.cli import run as command
 from unshade.components import Component
 from unshade.errors import UnshadeError
-from unshade.experiments import Options, jobs, methods, parts, run, subjects
+from unshade.experiments import Options, jobs, methods, page, parts, run, subjects
 from unshade.experiments.damage import ALL, damaged
 from unshade.experiments.drawings import DRAWINGS, drawing
 from unshade.experiments.options import METHODS, PARTS
@@ -280,7 +280,21 @@ def test_figures() -> None:
     assert best_within([[1.0, 20.0], [2.0, 30.0], [3.0, 25.0]], 2.5) == 30.0
     assert best_within([[1.0, 20.0]], 0.5) is None
     row = {"psnr": 30.0, "values": 9}
-    staged = [row | {"stages": {"nodes": n, "second_stage_nodes": k, "seconds": {"first stage": 1.0}}} for n, k in ((4, 1), (1, 1), (5, 0))]
+    staged = [
+        row | {"stages": {"nodes": n, "second_stage_nodes": k, "left_over": {"draws": k, "loss": 0}, "seconds": {"first stage": 1.0}}}
+        for n, k in ((4, 1), (1, 1), (5, 0))
+    ]
     found = figures(staged)["stages"]
+    assert found["left_over"] == {"draws": 2, "loss": 0}
     assert found["second_stage_share"] == 0.2
     assert found["root_left_over"] == pytest.approx(1 / 3, abs=1e-4)
+
+
+def test_the_page_says_what_was_aimed_at_and_links_only_to_what_is_there(tmp_path: Path) -> None:
+    summary = [{"dataset": "toon", "method": "learned:overall", "pictures": 8, "psnr": {"count": 8, "mean": mean}} for mean in (30.0, 30.1)]
+    missed, reached = (page._targets({"decomposition": {"summary": [entry]}})[2] for entry in summary)
+    assert missed == "| the paper's method, toon, dB | 30.08 | 30.0 | 8 | no |" and reached.endswith("| 8 | yes |")
+    assert page._targets({}) == []
+    (tmp_path / "there.md").write_text("")
+    text = "[a](there.md#x), [b](gone.md) and\n![c](gone.png)\n![d](there.md)"
+    assert page._existing(text, tmp_path) == "[a](there.md#x), b and\n![d](there.md)\n"

@@ -161,7 +161,7 @@ def test_more_samples_never_choose_a_worse_one(networks: Networks) -> None:
     part = Part(image, networks.vqvae.encode(image[None]), "operator", "open", 0)
     (ways,) = inference._splits([part], networks, settings, torch.Generator().manual_seed(0))
     losses = [way.terms.select for way in ways]
-    assert losses == sorted(losses) and len({way.kind for way in ways}) == len(ways)
+    assert losses == sorted(losses) and len({(way.operator, *(child.kind for child in way.children)) for way in ways}) == len(ways)
 
 
 def test_several_pools_differ_and_the_best_comes_first(networks: Networks) -> None:

@@ -60,14 +60,14 @@ def network_options(function: Any) -> Any:
             type=click.Choice(["size", "depth", "none"]),
             default="size",
             show_default=True,
-            help="Of --method learned, for nodes that the networks cannot decompose: our search, the paper's (minutes), or none.",
+            help="Of --method learned, for nodes that the networks leave over: our search, the paper's (minutes), or none.",
         ),
         click.option(
             "--method",
             type=click.Choice(["search", "learned", "hybrid"]),
             default="search",
             show_default=True,
-            help="Who proposes structures: the search, networks alone as in the paper, or networks whose trees the search finishes.",
+            help="Who proposes structures: the search, networks with a second stage as in the paper, or networks before a search.",
         ),
     ):
         function = option(function)

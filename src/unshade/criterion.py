@@ -38,8 +38,8 @@ class Terms:
 def criterion(
     parents: Image,
     shown: Image,
-    drawn: tuple[Image, Image],
-    whole: tuple[Image, Image],
+    through: tuple[Image, Image],
+    children: tuple[Image, Image],
     operators: torch.Tensor,
     masks: Mask,
     weights: Sequence[float],
@@ -47,19 +47,19 @@ def criterion(
     """L_select of B samples and its terms.
 
     Args:
-        parents: (B, 3, S, S). drawn: both children as they were decoded. whole: the same completed, or as they were decoded.
+        parents: (B, 3, S, S). through: both children as they come out of codes. children: the same, or completed.
         shown: what a child that is the parent again would look like: the parents, or as they come out of their codes.
         operators: (B,), index of `OPERATORS`. masks: (B, 1, S, S) in [0, 1]. weights: alpha, beta and gamma.
     """
     alpha, beta, gamma = weights
     disc = disc_mask(parents.shape[-1], device=parents.device)
-    rebuilt = torch.stack([BLENDS[name].apply(*drawn, *([masks] if name == "mix" else [])) for name in OPERATORS])
+    rebuilt = torch.stack([BLENDS[name].apply(*through, *([masks] if name == "mix" else [])) for name in OPERATORS])
     rebuilt = rebuilt[operators, torch.arange(len(operators), device=operators.device)]
     recon = _distance(parents, rebuilt, disc)
     mixed = operators == OPERATORS.index("mix")
 
     def near(other: Image, ignored: torch.Tensor | None = None) -> torch.Tensor:
-        least = torch.minimum(*(_distance(child, other, disc) for child in whole))
+        least = torch.minimum(*(_distance(child, other, disc) for child in children))
         found = -(least.clamp(LEAST, SEEN) / SEEN).log()
         return found if ignored is None else found.masked_fill(ignored, 0.0)
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from unshade.learned import Hybrid, Learned, SecondStageName, Settings
 
 METHODS = ("search", "learned", "hybrid")
-"""Who proposes structures: the search, networks alone as in the paper, or networks and the search together."""
+"""Who proposes structures: the search, networks with a second stage as in the paper, or networks and the search together."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def decompose(
         search: ``size`` grows trees leaf by leaf; ``depth`` is the paper's second stage, structures in order of depth
             fitted by BasinCMA, and takes about half a minute.
         objective: of ``depth``: ``l2`` compares pixels, ``paper`` pixels and VGG features, a hundred times slower.
-        method: who proposes structures: the ``search`` alone; ``learned``, networks alone as in the paper; ``hybrid``,
+        method: who proposes structures: the ``search`` alone; ``learned``, networks and a second stage, as in the paper; ``hybrid``,
             networks whose trees the search finishes. Without weights the hybrid is the search, and `Result.stages` says so.
         second_stage: of ``learned``, for nodes that the networks could not decompose: ``size`` is our search, ``depth``
             the paper's, minutes a picture, ``none`` makes them one colour.

@@ -15,13 +15,15 @@ below the depth limit. Where the paper's text has slips, or says less than a pro
   highlight, nearly blank, can never win. Here the distance is cut to [`LEAST`, `SEEN`] and divided by `SEEN`: a child that is
   visibly different costs nothing, one that is not costs up to ``log(SEEN / LEAST)``.
 - Blank and white are looked for in *encodings*, where 0 and 1 mean nothing of the kind. Here they are looked for in the pictures.
-- A child is compared with the parent as it comes out of its own codes, because a copy of the parent comes out of codes too.
+- A child that is to be decomposed further is what its sibling leaves of the parent (`remainders`), encoded anew. Decoded children are
+  blurred and their children more so; this way every level has the picture's own edges. L_recon then tells whether the completed
+  children, as they come out of their codes, still give the parent, and the other terms look at the completed children themselves.
+- A part that hardly shows in the picture is one colour, and what shows most is drawn for first.
 - A black or a white child is of no use under multiply and screen, but is a paint like any other under a mix.
 - Distances are root mean squares inside the disc, so that alpha, beta, gamma and tau do not depend on the size of the pictures.
 - g's mask is used as soft as it comes, because our Toon trees hold ramps; the paper's masks are 0 or 1.
 - All open nodes of a pool are one batch, not one node after the other. `Inference.trees` pools are kept side by side (the paper
   keeps one), ordered by the sum of their losses, tau for each node left over.
-- The codes of a child are those that were drawn for it; encoding its decoded picture once more would only blur it.
 """
 
 from __future__ import annotations
@@ -62,8 +64,7 @@ class Inference:
     nodes: int = 16
     """Most nodes of a pool that are decomposed, more than any tree of the released grammar has; the rest is left over."""
     draws: int = 12
-    """Most nodes that are drawn for over all pools, those of the best pool first; what is open then is left over. No picture needed more
-    than 35, which took twice as long for half a decibel (docs/learned.md)."""
+    """Most nodes that are drawn for over all pools, those first that show most; what is open then is left over."""
     similar: float = 0.02
     """alpha"""
     blank: float = 0.02
@@ -79,7 +80,8 @@ class Inference:
     remainders: bool = True
     """Give a child that is to be decomposed what its sibling leaves of the parent (`remainders`), not what was decoded for it alone."""
     hidden: float = 0.01
-    """A part that changes the picture by less than this, root mean square, against one colour is one colour."""
+    """A part that changes the picture by less than this, root mean square, against one colour is one colour. 0 for none, and for the
+    order of the pools in the place of what shows most."""
 
 
 Cause = Literal["loss", "depth", "nodes", "draws"]
@@ -197,11 +199,6 @@ class _Split:
     mask: Mask | None
     children: tuple[Part, Part]
 
-    @property
-    def kind(self) -> tuple[str, ...]:
-        """What tells two ways apart."""
-        return (self.operator, *(child.kind for child in self.children))
-
 
 @dataclass(frozen=True)
 class Round:
@@ -292,45 +289,68 @@ def _left_over(pool: Pool, places: Sequence[int], cause: Cause) -> Pool:
     return Pool(tuple(parts))
 
 
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Pairs of children of several parts, those of one part in a row."""
+
+    images: tuple[Image, Image]
+    """(B, 3, S, S) each, completed unless `Inference` says otherwise."""
+    codes: tuple[Codes, Codes]
+    operators: list[str]
+    masks: list[Mask | None]
+    kinds: list[tuple[str, str]]
+    terms: list[Terms]
+
+
+def _drawn(parts: Sequence[Part], networks: Networks, settings: Inference, generator: torch.Generator) -> _Drawn:
+    """Draw for several parts as one batch, and judge what comes."""
+    vqvae, heads = networks.vqvae, networks.heads
+    given = _stacked([part.codes for part in parts])
+    codes = networks.priors.sample_children(vqvae, given, settings.samples, generator, settings.temperature)
+    parents = torch.stack([part.image for part in parts]).repeat_interleave(settings.samples, 0)
+    images = _decoded(vqvae, codes)
+    numbers = heads.operator(parents, *images).argmax(1)
+    masks = torch.sigmoid(heads.mask(parents, *images))
+    operators = [OPERATORS[number] for number in numbers.tolist()]
+    known = [mask if operator == "mix" else None for operator, mask in zip(operators, masks, strict=True)]
+    first, second = ([TYPES[number] for number in heads.types(child).argmax(1).tolist()] for child in images)
+    kinds = list(zip(first, second, strict=True))
+    if settings.remainders:
+        pairs = [completed(*row) for row in zip(parents, operators, zip(*images, strict=True), known, kinds, strict=True)]
+        images = torch.stack([left for left, _ in pairs]), torch.stack([right for _, right in pairs])
+        codes = vqvae.encode(images[0]), vqvae.encode(images[1])
+        through, same = _decoded(vqvae, codes), parents
+    else:
+        through, same = images, vqvae.decode(given).repeat_interleave(settings.samples, 0)
+    terms = criterion(parents, same, through, images, numbers, masks, (settings.similar, settings.blank, settings.white))
+    return _Drawn(images, codes, operators, known, kinds, terms)
+
+
+def _decoded(vqvae: VQVAE, codes: tuple[Codes, Codes]) -> tuple[Image, Image]:
+    return vqvae.decode(codes[0]), vqvae.decode(codes[1])
+
+
 def _splits(parts: Sequence[Part], networks: Networks, settings: Inference, generator: torch.Generator) -> list[list[_Split]]:
     """For each part its decompositions, best first, no two of one kind."""
-    count = settings.samples
-    given = _stacked([part.codes for part in parts])
-    drawn = networks.priors.sample_children(networks.vqvae, given, count, generator, settings.temperature)
-    parents = torch.stack([part.image for part in parts]).repeat_interleave(count, 0)
-    shown = networks.vqvae.decode(given).repeat_interleave(count, 0)
-    left, right = (networks.vqvae.decode(codes) for codes in drawn)
-    operators = networks.heads.operator(parents, left, right).argmax(1)
-    masks = torch.sigmoid(networks.heads.mask(parents, left, right))
-    kinds = [networks.heads.types(child).argmax(1).tolist() for child in (left, right)]
-    names = [OPERATORS[int(number)] for number in operators]
-    known = [mask if name == "mix" else None for name, mask in zip(names, masks, strict=True)]
-    types = [(TYPES[first], TYPES[second]) for first, second in zip(*kinds, strict=True)]
-    whole = left, right
-    if settings.remainders:
-        pairs = (completed(*row) for row in zip(parents, names, zip(left, right, strict=True), known, types, strict=True))
-        whole = cast("tuple[Image, Image]", tuple(torch.stack(side) for side in zip(*pairs, strict=True)))
-        shown = parents
-        left, right = (networks.vqvae.decode(networks.vqvae.encode(side)) for side in whole)
-    terms = criterion(parents, shown, (left, right), whole, operators, masks, (settings.similar, settings.blank, settings.white))
-    found: list[list[_Split]] = []
+    drawn, found = _drawn(parts, networks, settings, generator), []
     for number, part in enumerate(parts):
-        rows = range(number * count, (number + 1) * count)
-        ways: dict[tuple[str, ...], _Split] = {}
-        for row in sorted(rows, key=lambda row: (terms[row].select, row)):
-            if (names[row], *types[row]) in ways:
-                continue
-            children = [side[row] for side in whole]
-            shares = gains(names[row], children, known[row])
-            made = tuple(
-                _child(part, image, share, kind, networks.vqvae.encode(image[None]) if settings.remainders else _one(codes, row), settings)
-                for image, share, kind, codes in zip(children, shares, types[row], drawn, strict=True)
-            )
-            ways[names[row], *types[row]] = _Split(terms[row], names[row], known[row], cast("tuple[Part, Part]", made))
-            if len(ways) == settings.choices:
-                break
-        found.append(list(ways.values()))
+        rows = range(number * settings.samples, (number + 1) * settings.samples)
+        best: dict[tuple[str, ...], int] = {}
+        for row in sorted(rows, key=lambda row: (drawn.terms[row].select, row)):
+            best.setdefault((drawn.operators[row], *drawn.kinds[row]), row)
+        found.append([_split_of(part, drawn, row, settings) for row in list(best.values())[: settings.choices]])
     return found
+
+
+def _split_of(part: Part, drawn: _Drawn, row: int, settings: Inference) -> _Split:
+    operator, mask = drawn.operators[row], drawn.masks[row]
+    images = [side[row] for side in drawn.images]
+    shares = gains(operator, images, mask)
+    left, right = (
+        _child(part, image, share, kind, _one(codes, row), settings)
+        for image, share, kind, codes in zip(images, shares, drawn.kinds[row], drawn.codes, strict=True)
+    )
+    return _Split(drawn.terms[row], operator, mask, (left, right))
 
 
 def _child(parent: Part, image: Image, share: Image, kind: str, codes: Codes, settings: Inference) -> Part:

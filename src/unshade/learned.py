@@ -91,7 +91,7 @@ class Stages:
     nodes: int = 0
     """Of the chosen tree that were to be decomposed."""
     second_stage_nodes: int = 0
-    """Of them, those that the networks could not decompose. All of them are one, the picture itself, where the networks found nothing."""
+    """Of them, those that were left over, whatever the cause. All of them are one, the picture itself, where the networks found nothing."""
     left_over: dict[Cause, int] = field(default_factory=lambda: dict.fromkeys(get_args(Cause), 0))
     """The same by why."""
     drawn_nodes: int = 0

@@ -1,9 +1,9 @@
 """The methods of the experiments by name.
 
 - ``cnn``, ``lstm``, ``transformer``: the baselines; with ``+fit`` our fit of the whole tree goes over what they found.
-- ``learned``: the paper's method; ``learned:base``, ``learned:samples``, ``learned:second``, ``learned:overall`` and
-  ``learned`` itself (``learned:full`` is the same) are its ablation; ``learned:alone`` has no second stage, ``learned:depth``
-  the paper's own, minutes a picture.
+- ``learned``: the paper's stages, and a second look of ours; ``learned:base``, ``learned:samples``, ``learned:second``,
+  ``learned:overall`` and ``learned`` itself (``learned:full`` is the same) are its ablation; ``learned:alone`` has no second
+  stage, ``learned:depth`` the paper's own, minutes a picture.
 - ``search:PRESET``, ``hybrid:PRESET``: ours; with ``+reflections`` a reflected environment is held as a picture.
 """
 
@@ -38,9 +38,9 @@ VARIANTS: dict[str, Settings] = {
     "alone": Settings(second_stage="none"),
     "depth": Settings(second_stage="depth"),
 }
-"""Of ``learned``: one sample; several; the second stage; the optimisation of the whole tree, which makes the paper's method; a second look
-at nodes in their place, which is ours and the default. ``alone`` is all but the second stage, so that no search helps the networks;
-``depth`` has the paper's second stage."""
+"""Of ``learned``: one sample; several; the second stage; the optimisation of the whole tree, which makes all stages of the
+paper; a second look at nodes in their place, which is ours and the default. ``alone`` is all but the second stage, so that no
+search helps the networks; ``depth`` has the paper's second stage."""
 
 FIT = "+fit"
 

@@ -42,10 +42,12 @@ def figures(rows: Sequence[Row]) -> dict[str, Any]:
     staged = [row["stages"] for row in rows if row.get("stages")]
     if staged:
         names = dict.fromkeys(name for stages in staged for name in stages["seconds"])
+        causes = dict.fromkeys(cause for stages in staged for cause in stages["left_over"])
         found["stages"] = {
             "second_stage_share": rounded(sum(s["second_stage_nodes"] for s in staged) / max(1, sum(s["nodes"] for s in staged))),
             # Nothing was decomposed by the networks: what was found is the second stage's alone.
             "root_left_over": rounded(sum(s["nodes"] == s["second_stage_nodes"] for s in staged) / len(staged)),
+            "left_over": {cause: sum(s["left_over"].get(cause, 0) for s in staged) for cause in causes},
             "seconds": {name: rounded(quantile([s["seconds"].get(name, 0.0) for s in staged], 0.5)) for name in names},
         }
     return found
