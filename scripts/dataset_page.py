@@ -66,10 +66,10 @@ FILES = """
 ## As files
 
 ```sh
-unshade dataset make realistic -o data/realistic --trees 20000
+unshade dataset make both -o data/both --trees 20000     # what `unshade train --shards data/both` wants
 unshade dataset make toon -o data/toon-test --split test --trees 500 --size 128
-unshade dataset info data/realistic
-unshade dataset check data/realistic
+unshade dataset info data/both
+unshade dataset check data/both
 ```
 
 `manifest.json` holds the settings, the counts and the SHA-256 of each shard. A shard is a safetensors file with one row a node: `image`
