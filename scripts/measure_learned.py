@@ -42,7 +42,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE, RESULTS = ROOT / "docs" / "learned.md", ROOT / "benchmarks" / "results" / "learned.json"
 PARTS = ("table", "seconds")
 
-DRAWS = (12, 64)
+DRAWS = (12,)
 """Budgets of nodes to draw for (`Inference.draws`) whose seconds are measured."""
 
 TIMED = 4
