@@ -12,7 +12,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from unshade import baselines
+from unshade import baselines, second_stage
 from unshade.bench.datasets import Case
 from unshade.cli import run as command
 from unshade.components import Component
@@ -24,6 +24,7 @@ from unshade.experiments.options import METHODS, PARTS
 from unshade.experiments.pieces import pieces, swapped
 from unshade.experiments.runner import write_page
 from unshade.experiments.summaries import best_within, figures
+from unshade.growth import Effort
 from unshade.inference import Inference
 from unshade.learned import Settings
 from unshade.metrics import psnr
@@ -138,6 +139,9 @@ def test_other_settings_are_another_method(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(methods.VARIANTS, "full", Settings(Inference(draws=3)))
     assert methods.digest("learned", None) != before["learned"]
     assert methods.digest("learned:alone", None) == before["learned:alone"]
+    monkeypatch.setattr(second_stage, "NODE_EFFORT", Effort(9))
+    assert methods.digest("learned:alone", None) != before["learned:alone"]
+    assert methods.digest("hybrid:draft", None) == before["hybrid:draft"]
 
 
 def test_rows_name_the_code_that_measured(tmp_path: Path, data: Path) -> None:

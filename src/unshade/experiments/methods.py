@@ -17,7 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from unshade import baselines, learned
+from unshade import baselines, learned, second_stage
 from unshade.decompose import Decomposition, decompose, fit
 from unshade.errors import MissingWeightsError, UnshadeError, did_you_mean
 from unshade.inference import Inference
@@ -114,7 +114,8 @@ def _settings(method: str) -> tuple[Any, ...]:
     name = name_of(method)
     preset = PRESETS[name.argument] if name.argument in PRESETS else PRESETS["balanced"] if name.kind in ("search", *NETWORKS) else None
     networks = {"learned": VARIANTS.get(name.argument or "full"), "hybrid": learned.PROPOSED}.get(name.kind)
-    return preset, networks
+    fixed = (learned.PLACED_STEPS, learned.WHOLE_STEPS, learned.SURVIVORS, second_stage.NODE_EFFORT) if name.kind == "learned" else ()
+    return preset, networks, fixed
 
 
 @lru_cache(maxsize=16)
