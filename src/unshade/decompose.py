@@ -134,7 +134,7 @@ def decompose(
         objective: of ``depth``: ``l2`` compares pixels, ``paper`` pixels and VGG features, a hundred times slower.
         method: who proposes structures: the ``search`` alone; ``learned``, networks and a second stage, as in the paper; ``hybrid``,
             networks whose trees the search finishes. Without weights the hybrid is the search, and `Result.stages` says so.
-        second_stage: of ``learned``, for nodes that the networks could not decompose: ``size`` is our search, ``depth``
+        second_stage: of ``learned``, for nodes that the networks leave over: ``size`` is our search, ``depth``
             the paper's, minutes a picture, ``none`` makes them one colour.
         weights: folder of the networks; None for those that ship.
         device: where the networks of ``learned`` and ``hybrid`` are, such as ``cuda``; other samples come out there.

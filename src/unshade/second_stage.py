@@ -1,4 +1,4 @@
-"""The second stage of the learned method: the nodes that the networks could not decompose.
+"""The second stage of the learned method: the nodes that the networks leave over.
 
 A node is decomposed twice. First its picture as the first stage left it, 64 pixels wide and a little wrong, so that every node has some
 tree. Then, beyond the paper, what it has to show *in its place*: the operators above it are undone with the siblings as they are by
@@ -65,7 +65,7 @@ class SecondStage:
         """Fits of whole structures."""
 
     def decompose(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node:
-        """The tree of a node that was left over: of the picture itself where it is the root, else of what was decoded."""
+        """The tree of a node that was left over: of the picture itself where it is the root, else of the node's own."""
         if not place:
             # Grown, but not looked at as a drawing, which would be the search in the place of the networks.
             return self._searched(self.main.samples, dataclasses.replace(self.main.effort, beam=0, rounds=0))
