@@ -8,8 +8,10 @@ on (style, split, seed, n), so data can be made anywhere and in any order.
 
 from __future__ import annotations
 
+import atexit
 import dataclasses
 import hashlib
+import os
 import random
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -277,7 +279,13 @@ def _ahead(batches: Dataset[Any], first: int, workers: int) -> DataLoader[Any]:
         prefetch_factor=2,
         collate_fn=_as_it_is,
         multiprocessing_context="spawn",
+        worker_init_fn=_ends_at_once,
     )
+
+
+def _ends_at_once(worker: int) -> None:
+    """Let this worker leave without taking its interpreter apart, which aborts it where a thread still packs a batch that no one waits for."""
+    atexit.register(os._exit, 0)
 
 
 @dataclass(frozen=True)
