@@ -284,7 +284,7 @@ def _ahead(batches: Dataset[Any], first: int, workers: int) -> DataLoader[Any]:
 
 
 def _ends_at_once(worker: int) -> None:
-    """Let this worker leave without taking its interpreter apart, which aborts it where a thread still packs a batch that no one waits for."""
+    """Let this worker leave without taking its interpreter apart, which aborts it where a thread still packs a batch."""
     atexit.register(os._exit, 0)
 
 
