@@ -14,6 +14,7 @@ from unshade.models import heads, pixelsnail, weights
 from unshade.models.config import CONFIGS, Config, ConfigError, find
 from unshade.models.pixelsnail import PixelSNAIL
 from unshade.models.prior import Priors, Tables, repeat
+from unshade.models.sampling import pick
 from unshade.models.vqvae import VQVAE, Codebook, codebook_use
 from unshade.render import render
 from unshade.sphere import sphere_normals
@@ -160,10 +161,11 @@ def test_the_shipped_prior_draws_the_same_codes_with_the_cache(level: str, sampl
 
 def test_codes_are_drawn_as_often_as_they_are_likely() -> None:
     likely = torch.tensor([0.0, 0.5, 0.0, 0.3, 0.2, 0.0])
-    drawn = pixelsnail._draw(likely.log().expand(20_000, -1), torch.Generator().manual_seed(1), 1.0)
+    chances = torch.rand(20_000, 1, generator=torch.Generator().manual_seed(1))
+    drawn = pick(likely.log().expand(20_000, -1), chances, 1.0)
     assert torch.allclose(drawn.bincount(minlength=6) / 20_000, likely, atol=0.02)
     assert set(drawn.tolist()) == {1, 3, 4}
-    sharper = pixelsnail._draw(likely.log().expand(20_000, -1), torch.Generator().manual_seed(1), 0.5)
+    sharper = pick(likely.log().expand(20_000, -1), chances, 0.5)
     assert torch.allclose(sharper.bincount(minlength=6) / 20_000, likely.square() / likely.square().sum(), atol=0.02)
 
 
