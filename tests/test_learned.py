@@ -27,7 +27,7 @@ from unshade.inference import Inference, Networks, Part, Pool, Round, infer, nod
 from unshade.models import weights
 from unshade.models.config import find
 from unshade.models.vqvae import Codes
-from unshade.nodes import Leaf, Node, Operator, Tree, leaf, mix, multiply, screen, walk
+from unshade.nodes import Leaf, Node, Operator, Tree, count_values, leaf, mix, multiply, screen, walk
 from unshade.parameters import Layout
 from unshade.pictures import write_picture
 from unshade.proposals import Fits, arranged
@@ -398,9 +398,40 @@ def test_undoing_the_operators_gives_what_a_node_shows() -> None:
 def test_a_node_that_shows_little_of_itself_gets_few_values() -> None:
     stage = second_stage.SecondStage(SimpleNamespace(), Fits())  # type: ignore[arg-type]
     pixels = Pixels.of(picture(PAINTED), None, 40)
-    sizes = [Tree(stage._of_node(pixels, gain)).values for gain in (0.01, 0.25, 1.0)]
+    sizes = [Tree(stage._of_node(pixels, second_stage._room(gain))).values for gain in (0.01, 0.25, 1.0)]
     most = second_stage.NODE_EFFORT.max_values
     assert sizes[0] == 3 < sizes[1] <= most / 2 < sizes[2] <= most
+
+
+def test_what_several_pools_leave_over_is_decomposed_once() -> None:
+    stage = second_stage.SecondStage(SimpleNamespace(samples=SimpleNamespace(coarse=Pixels.of(picture(PAINTED)))), Fits())  # type: ignore[arg-type]
+    codes, body = Codes(*[torch.zeros(1)] * 4), picture(PAINTED.children[0], 64)  # type: ignore[union-attr]
+    left = Part(body, codes, "operator", "left over", 1)
+    root = Part(picture(PAINTED, 64), codes, "operator", "split", 0, operator="screen", children=(1, 2))
+    light = PAINTED.children[1]  # type: ignore[union-attr]
+    pools = [Pool((root, dataclasses.replace(left, cause=cause), left)) for cause in ("draws", "loss")]
+    first = stage.decompose(pools[0], 1, {2: light})
+    fits = stage.count
+    assert fits > 0 and stage.decompose(pools[1], 1, {2: light}) is first and stage.count == fits
+    # Where its siblings leave it less room, it is another question.
+    smaller = stage.decompose(pools[1], 1, {2: leaf("albedo", color=(0.9, 0.9, 0.9))})
+    assert stage.count > fits and count_values(smaller) < count_values(first)
+
+
+def test_the_leaf_that_is_missed_least_goes_first() -> None:
+    faint = leaf("highlight", direction=(0.5, 0.2, 0.85), sharpness=20.0, amplitude=0.05)
+    root = screen(SIMPLE, faint)
+    pixels = Pixels.of(picture(root), None, 40)
+    smaller = learned.least_useful(root, pixels)
+    assert smaller is not None and sorted(entry.kind for entry in _leaves(smaller)) == ["albedo", "diffuse", "highlight"]
+    assert min(float(entry["amplitude"][0]) for entry in _leaves(smaller) if entry.kind == "highlight") > 0.5
+    left = learned.within(root, pixels, 11)
+    assert left is not None and count_values(left) <= 11
+    assert learned.least_useful(leaf("albedo"), pixels) is None
+
+
+def _leaves(root: Node) -> list[Leaf]:
+    return [node for _, node in walk(root) if isinstance(node, Leaf)]
 
 
 def test_looking_at_a_node_in_its_place_mends_what_was_decoded_badly(monkeypatch: pytest.MonkeyPatch) -> None:

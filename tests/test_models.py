@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from unshade.errors import MissingWeightsError
-from unshade.models import heads, pixelsnail, weights
+from unshade.models import heads, pixelsnail, sampling, weights
 from unshade.models.config import CONFIGS, Config, ConfigError, find
 from unshade.models.pixelsnail import PixelSNAIL
 from unshade.models.prior import Priors, Tables, repeat
-from unshade.models.sampling import pick
 from unshade.models.vqvae import VQVAE, Codebook, codebook_use
 from unshade.render import render
 from unshade.sphere import sphere_normals
 from unshade.text import parse
+from unshade.threads import threads
 
 TINY = find("tiny")
 DRAWN = dataclasses.replace(TINY, prior=dataclasses.replace(TINY.prior, blocks=2, layers=2, dropout=0.0))
@@ -137,6 +137,24 @@ def test_sampling_with_the_cache_draws_the_same_codes(temperature: float, at_onc
         assert drawn[0][0].bottom.unique().numel() > 4
 
 
+@pytest.mark.parametrize("count", [1, 7, 12])
+def test_threads_share_the_maps_and_draw_the_same_codes(count: int) -> None:
+    """In TorchScript and, as on a GPU, without it."""
+    net = PixelSNAIL(4, 16, 8, DRAWN.prior).double().eval()
+    entries, condition = torch.randn(16, 8).double(), torch.randn(count, 16, 4, 4).double()
+
+    def drawn(shared: int) -> torch.Tensor:
+        with threads(shared):
+            return net.sample(entries, condition, torch.Generator().manual_seed(7))
+
+    alone = drawn(1)
+    assert alone.shape == (count, 4, 4) and alone.unique().numel() > 4
+    assert torch.equal(alone, drawn(2)) and torch.equal(alone, drawn(3))
+    chances = pixelsnail._chances(condition, 16, torch.Generator().manual_seed(7))[0]
+    with torch.no_grad():
+        assert torch.equal(alone.flatten(1), sampling.draw(net.begun(condition, entries), entries, chances, 1.0))
+
+
 @pytest.mark.skipif(not weights.available(), reason="no weights ship with this checkout")
 @pytest.mark.parametrize(("level", "samples"), [("top", 2), pytest.param("bottom", 1, marks=pytest.mark.slow)])
 def test_the_shipped_prior_draws_the_same_codes_with_the_cache(level: str, samples: int) -> None:
@@ -162,10 +180,10 @@ def test_the_shipped_prior_draws_the_same_codes_with_the_cache(level: str, sampl
 def test_codes_are_drawn_as_often_as_they_are_likely() -> None:
     likely = torch.tensor([0.0, 0.5, 0.0, 0.3, 0.2, 0.0])
     chances = torch.rand(20_000, 1, generator=torch.Generator().manual_seed(1))
-    drawn = pick(likely.log().expand(20_000, -1), chances, 1.0)
+    drawn = sampling.pick(likely.log().expand(20_000, -1), chances, 1.0)
     assert torch.allclose(drawn.bincount(minlength=6) / 20_000, likely, atol=0.02)
     assert set(drawn.tolist()) == {1, 3, 4}
-    sharper = pick(likely.log().expand(20_000, -1), chances, 0.5)
+    sharper = sampling.pick(likely.log().expand(20_000, -1), chances, 0.5)
     assert torch.allclose(sharper.bincount(minlength=6) / 20_000, likely.square() / likely.square().sum(), atol=0.02)
 
 

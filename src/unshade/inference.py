@@ -125,7 +125,9 @@ def _loaded(folder: Path, ages: tuple[int, ...], device: str) -> Networks:
         alike = weights.same_codes(vqvae.config, other.config) if name == "prior" else vqvae.config.size == other.config.size
         if not alike:
             raise weights.WeightsError(f"{weights.file_of(name, folder)}: made for other images or codes than vqvae.safetensors beside it")
-    return Networks(cast(VQVAE, vqvae.model), cast(Priors, priors.model), cast(Heads, heads.model), vqvae.config)
+    # Convolutions take a third less time where the channels of a pixel lie side by side.
+    models = [found.model.to(memory_format=torch.channels_last) for found in (vqvae, priors, heads)]  # type: ignore[call-overload]
+    return Networks(cast(VQVAE, models[0]), cast(Priors, models[1]), cast(Heads, models[2]), vqvae.config)
 
 
 @dataclass(frozen=True, eq=False)

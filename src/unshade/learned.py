@@ -48,6 +48,9 @@ SURVIVORS = 2
 OFFERED = 4
 """Changes of a proposal that are looked at closely."""
 
+REMOVED = 5
+"""Leaves whose loss is looked at closely, those that are missed least at once."""
+
 SecondStageName = Literal["size", "depth", "none"]
 
 
@@ -359,8 +362,11 @@ class Unproposed(Search):
 
 def least_useful(root: Node, pixels: Pixels, steps: int = 3) -> Node | None:
     """The tree without the leaf whose loss hurts least after so many steps of a fit; None where only one is left."""
-    options = [fit_pixels(pixels, smaller, steps=steps, softest=FINE_SOFTNESS) for smaller in removals(root)]
-    return min(options, key=lambda option: option.error).root if options else None
+    options = sorted(((error_of(pixels, smaller), k, smaller) for k, smaller in enumerate(removals(root))), key=lambda option: option[:2])
+    if not options or not steps:
+        return options[0][2] if options else None
+    close = [fit_pixels(pixels, smaller, steps=steps, softest=FINE_SOFTNESS) for _, _, smaller in options[:REMOVED]]
+    return min(close, key=lambda option: option.error).root
 
 
 def within(root: Node, pixels: Pixels, most: int) -> Node | None:

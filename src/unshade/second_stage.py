@@ -63,6 +63,8 @@ class SecondStage:
         self.main, self.fits = main, fits
         self.count = 0
         """Fits of whole structures."""
+        self.known: dict[tuple[Image, int], Node] = {}
+        """The trees of pictures with so much room: pools share many of the nodes that they leave over."""
 
     def decompose(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node:
         """The tree of a node that was left over: of the picture itself where it is the root, else of the node's own."""
@@ -70,24 +72,29 @@ class SecondStage:
             # Grown, but not looked at as a drawing, which would be the search in the place of the networks.
             return self._searched(self.main.samples, dataclasses.replace(self.main.effort, beam=0, rounds=0))
         _, gain = wanted(pool, place, second, self.fits, self.main.samples.coarse)
-        return self._of_node(Pixels.of(pool.parts[place].image.cpu(), None, SIZE), gain)
+        image, room = pool.parts[place].image, _room(gain)
+        if (image, room) not in self.known:
+            self.known[image, room] = self._of_node(Pixels.of(image.cpu(), None, SIZE), room)
+        return self.known[image, room]
 
     def in_place(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node | None:
         """Another tree of a node below the root, of what it has to show in its place; None where that can hardly be seen."""
         pixels, gain = wanted(pool, place, second, self.fits, self.main.samples.coarse)
-        return self._of_node(pixels, gain) if gain >= HIDDEN else None
+        return self._of_node(pixels, _room(gain)) if gain >= HIDDEN else None
 
-    def _of_node(self, pixels: Pixels, gain: float) -> Node:
-        """A node that shows little of itself is one colour, or a small tree."""
-        room = NODE_EFFORT.max_values * min(gain / ALL, 1.0) if gain >= HIDDEN else 0.0
+    def _of_node(self, pixels: Pixels, room: int) -> Node:
         dictionary = dictionary_of(pixels)
-        samples = Samples(pixels, pixels, pixels, dictionary, dictionary)
-        return self._searched(samples, dataclasses.replace(NODE_EFFORT, max_values=max(round(room), ALBEDO)))
+        return self._searched(Samples(pixels, pixels, pixels, dictionary, dictionary), dataclasses.replace(NODE_EFFORT, max_values=room))
 
     def _searched(self, samples: Samples, effort: Effort) -> Node:
         steps = [found for _, found in Search(samples, effort).run()]
         self.count += len(steps)
         return steps[-1].root
+
+
+def _room(gain: float) -> int:
+    """Values that a node may have: one that shows little of itself is one colour, or a small tree."""
+    return max(round(NODE_EFFORT.max_values * min(gain / ALL, 1.0)), ALBEDO) if gain >= HIDDEN else ALBEDO
 
 
 class SecondStageByDepth(SecondStage):

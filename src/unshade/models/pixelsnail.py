@@ -189,12 +189,13 @@ class PixelSNAIL(nn.Module):
             (N, H, W) int64.
         """
         parts = _parts(condition, _chances(condition, self.size**2, generator))
-        return torch.cat(_at_once([partial(self._sample, entries, *part, temperature) for part in parts], condition.device))
+        draw = sampling.compiled() if condition.device.type == "cpu" else sampling.draw
 
-    @torch.inference_mode()
-    def _sample(self, entries: Tensor, condition: Tensor, chances: Tensor, temperature: float) -> Tensor:
-        run = sampling.compiled() if entries.device.type == "cpu" else sampling.draw
-        return run(self.begun(condition, entries), entries, chances, temperature).unflatten(1, (self.size, self.size))
+        @torch.inference_mode()
+        def drawn(part: Tensor, chances: Tensor) -> Tensor:
+            return draw(self.begun(part, entries), entries, chances, temperature).unflatten(1, (self.size, self.size))
+
+        return torch.cat(_at_once([partial(drawn, *part) for part in parts], condition.device))
 
     def begun(self, condition: Tensor, entries: Tensor) -> sampling.State:
         """Before the first code is drawn."""
