@@ -179,11 +179,19 @@ def test_several_pools_differ_and_the_best_comes_first(networks: Networks) -> No
     assert len({tuple((part.kind, part.operator) for part in pool.parts) for pool in found}) == len(found)
 
 
-def terms(parent: torch.Tensor, left: torch.Tensor, right: torch.Tensor, operator: str, mask: torch.Tensor | None = None) -> Terms:
+def terms(
+    parent: torch.Tensor,
+    left: torch.Tensor,
+    right: torch.Tensor,
+    operator: str,
+    mask: torch.Tensor | None = None,
+    drawn: tuple[torch.Tensor, torch.Tensor] | None = None,
+) -> Terms:
     masks = torch.zeros(1, 1, SIZE, SIZE) if mask is None else mask[None]
     number = torch.tensor([synthesis.OPERATORS.index(operator)])
     children = left[None], right[None]
-    return criterion(parent[None], parent[None], children, children, number, masks, (0.02, 0.02, 0.02))[0]
+    first = children if drawn is None else (drawn[0][None], drawn[1][None])
+    return criterion(parent[None], parent[None], first, children, children, number, masks, (0.02, 0.02, 0.02, 0.5))[0]
 
 
 def test_the_criterion_of_a_right_decomposition_is_nothing() -> None:
@@ -192,6 +200,15 @@ def test_the_criterion_of_a_right_decomposition_is_nothing() -> None:
     found = terms(picture(SIMPLE, SIZE) * disc, left, right, "screen")
     assert found.recon == pytest.approx(0.0, abs=1e-6)
     assert found.similar == found.blank == found.white == 0.0
+
+
+def test_of_two_that_explain_a_node_alike_the_one_that_was_drawn_right_is_better() -> None:
+    disc = disc_mask(SIZE)
+    parent = picture(SIMPLE, SIZE) * disc
+    left, right = (picture(child, SIZE) * disc for child in SIMPLE.children)
+    good, bad = (terms(parent, left, right, "screen", drawn=(first, right)) for first in (left * 0.99, left * 0.6))
+    assert good.recon == bad.recon < 1e-6 and 0.0 < good.drawn < bad.drawn
+    assert bad.select - good.select == pytest.approx(0.5 * (bad.drawn - good.drawn), abs=1e-6)
 
 
 def test_one_useless_child_is_enough_to_cost() -> None:

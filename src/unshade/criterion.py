@@ -28,6 +28,8 @@ class Terms:
     """The criterion of one sample."""
 
     recon: float
+    drawn: float
+    """L_recon of the children as they were drawn, not completed."""
     similar: float
     blank: float
     white: float
@@ -38,6 +40,7 @@ class Terms:
 def criterion(
     parents: Image,
     shown: Image,
+    drawn: tuple[Image, Image],
     through: tuple[Image, Image],
     children: tuple[Image, Image],
     operators: torch.Tensor,
@@ -47,15 +50,19 @@ def criterion(
     """L_select of B samples and its terms.
 
     Args:
-        parents: (B, 3, S, S). through: both children as they come out of codes. children: the same, or completed.
+        parents: (B, 3, S, S). drawn: both children as they were decoded. children: the same, or completed. through: these as they come
+            out of codes.
         shown: what a child that is the parent again would look like: the parents, or as they come out of their codes.
-        operators: (B,), index of `OPERATORS`. masks: (B, 1, S, S) in [0, 1]. weights: alpha, beta and gamma.
+        operators: (B,), index of `OPERATORS`. masks: (B, 1, S, S) in [0, 1]. weights: alpha, beta, gamma, and of what is drawn.
     """
-    alpha, beta, gamma = weights
+    alpha, beta, gamma, delta = weights
     disc = disc_mask(parents.shape[-1], device=parents.device)
-    rebuilt = torch.stack([BLENDS[name].apply(*through, *([masks] if name == "mix" else [])) for name in OPERATORS])
-    rebuilt = rebuilt[operators, torch.arange(len(operators), device=operators.device)]
-    recon = _distance(parents, rebuilt, disc)
+
+    def missed(pair: tuple[Image, Image]) -> torch.Tensor:
+        rebuilt = torch.stack([BLENDS[name].apply(*pair, *([masks] if name == "mix" else [])) for name in OPERATORS])
+        return _distance(parents, rebuilt[operators, torch.arange(len(operators), device=operators.device)], disc)
+
+    recon, at_first = missed(through), missed(drawn)
     mixed = operators == OPERATORS.index("mix")
 
     def near(other: Image, ignored: torch.Tensor | None = None) -> torch.Tensor:
@@ -65,8 +72,8 @@ def criterion(
 
     similar = near(shown)
     blank, white = near(torch.zeros_like(parents), mixed), near(disc.to(parents).expand_as(parents), mixed)
-    select = recon + alpha * similar + beta * blank + gamma * white
-    columns = (column.tolist() for column in (recon, similar, blank, white, select))
+    select = recon + delta * at_first + alpha * similar + beta * blank + gamma * white
+    columns = (column.tolist() for column in (recon, at_first, similar, blank, white, select))
     return [Terms(*row) for row in zip(*columns, strict=True)]
 
 

@@ -18,6 +18,8 @@ below the depth limit. Where the paper's text has slips, or says less than a pro
 - A child that is to be decomposed further is what its sibling leaves of the parent (`remainders`), encoded anew. Decoded children are
   blurred and their children more so; this way every level has the picture's own edges. L_recon then tells whether the completed
   children, as they come out of their codes, still give the parent, and the other terms look at the completed children themselves.
+  That says little about which of many samples is right, since what one child lacks the other has: so L_recon of the children as they
+  were drawn counts too, half.
 - A part that hardly shows in the picture is one colour, and what shows most is drawn for first.
 - A black or a white child is of no use under multiply and screen, but is a paint like any other under a mix.
 - Distances are root mean squares inside the disc, so that alpha, beta, gamma and tau do not depend on the size of the pictures.
@@ -55,7 +57,7 @@ from unshade.types import Image, Mask
 class Inference:
     """How the first stage works; the numbers are ours, the paper gives none."""
 
-    samples: int = 16
+    samples: int = 10
     """T, drawn of each node."""
     temperature: float = 0.7
     """Of the priors: under 1 likely codes become likelier."""
@@ -71,6 +73,8 @@ class Inference:
     """beta"""
     white: float = 0.02
     """gamma"""
+    drawn: float = 0.5
+    """Weight of L_recon of the children as they were decoded, beside that of the completed ones; of no use without `remainders`."""
     stop: float = 0.08
     """tau, on the scale of L_recon: 0.08 is 22 dB."""
     trees: int = 3
@@ -310,21 +314,22 @@ def _drawn(parts: Sequence[Part], networks: Networks, settings: Inference, gener
     given = _stacked([part.codes for part in parts])
     codes = networks.priors.sample_children(vqvae, given, settings.samples, generator, settings.temperature)
     parents = torch.stack([part.image for part in parts]).repeat_interleave(settings.samples, 0)
-    images = _decoded(vqvae, codes)
+    images = first = _decoded(vqvae, codes)
     numbers = heads.operator(parents, *images).argmax(1)
     operators = [OPERATORS[number] for number in numbers.tolist()]
     masks = _masks(heads, parents, images, numbers == OPERATORS.index("mix"))
     known = [mask if operator == "mix" else None for operator, mask in zip(operators, masks, strict=True)]
-    first, second = ([TYPES[number] for number in heads.types(child).argmax(1).tolist()] for child in images)
-    kinds = list(zip(first, second, strict=True))
+    left, right = ([TYPES[number] for number in heads.types(child).argmax(1).tolist()] for child in images)
+    kinds = list(zip(left, right, strict=True))
     if settings.remainders:
         pairs = [completed(*row) for row in zip(parents, operators, zip(*images, strict=True), known, kinds, strict=True)]
-        images = torch.stack([left for left, _ in pairs]), torch.stack([right for _, right in pairs])
+        images = torch.stack([pair[0] for pair in pairs]), torch.stack([pair[1] for pair in pairs])
         codes = vqvae.encode(images[0]), vqvae.encode(images[1])
         through, same = _decoded(vqvae, codes), parents
     else:
         through, same = images, vqvae.decode(given).repeat_interleave(settings.samples, 0)
-    terms = criterion(parents, same, through, images, numbers, masks, (settings.similar, settings.blank, settings.white))
+    weigh = (settings.similar, settings.blank, settings.white, settings.drawn if settings.remainders else 0.0)
+    terms = criterion(parents, same, first, through, images, numbers, masks, weigh)
     return _Drawn(images, codes, operators, known, kinds, terms)
 
 
