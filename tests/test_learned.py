@@ -208,7 +208,7 @@ def test_of_two_that_explain_a_node_alike_the_one_that_was_drawn_right_is_better
     left, right = (picture(child, SIZE) * disc for child in SIMPLE.children)
     good, bad = (terms(parent, left, right, "screen", drawn=(first, right)) for first in (left * 0.99, left * 0.6))
     assert good.recon == bad.recon < 1e-6 and 0.0 < good.drawn < bad.drawn
-    assert bad.select - good.select == pytest.approx(0.5 * (bad.drawn - good.drawn), abs=1e-6)
+    assert bad.select == good.select == good.recon and bad.rank - good.rank == pytest.approx(0.5 * (bad.drawn - good.drawn), abs=1e-6)
 
 
 def test_one_useless_child_is_enough_to_cost() -> None:

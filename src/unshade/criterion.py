@@ -34,7 +34,9 @@ class Terms:
     blank: float
     white: float
     select: float
-    """All of them, weighted."""
+    """The paper's four, weighted."""
+    rank: float
+    """What samples are ordered by: ``select``, and what is drawn."""
 
 
 def criterion(
@@ -72,8 +74,8 @@ def criterion(
 
     similar = near(shown)
     blank, white = near(torch.zeros_like(parents), mixed), near(disc.to(parents).expand_as(parents), mixed)
-    select = recon + delta * at_first + alpha * similar + beta * blank + gamma * white
-    columns = (column.tolist() for column in (recon, at_first, similar, blank, white, select))
+    select = recon + alpha * similar + beta * blank + gamma * white
+    columns = (column.tolist() for column in (recon, at_first, similar, blank, white, select, select + delta * at_first))
     return [Terms(*row) for row in zip(*columns, strict=True)]
 
 

@@ -18,8 +18,8 @@ below the depth limit. Where the paper's text has slips, or says less than a pro
 - A child that is to be decomposed further is what its sibling leaves of the parent (`remainders`), encoded anew. Decoded children are
   blurred and their children more so; this way every level has the picture's own edges. L_recon then tells whether the completed
   children, as they come out of their codes, still give the parent, and the other terms look at the completed children themselves.
-  That says little about which of many samples is right, since what one child lacks the other has: so L_recon of the children as they
-  were drawn counts too, half.
+  That says little about which of many samples is right, since what one child lacks the other has: so among them L_recon of the
+  children as they were drawn counts too, half. It has no part in what tau is asked of.
 - A part that hardly shows in the picture is one colour, and what shows most is drawn for first.
 - A black or a white child is of no use under multiply and screen, but is a paint like any other under a mix.
 - Distances are root mean squares inside the disc, so that alpha, beta, gamma and tau do not depend on the size of the pictures.
@@ -74,7 +74,7 @@ class Inference:
     white: float = 0.02
     """gamma"""
     drawn: float = 0.5
-    """Weight of L_recon of the children as they were decoded, beside that of the completed ones; of no use without `remainders`."""
+    """Weight of L_recon of the children as they were decoded, where samples are ordered; of no use without `remainders`."""
     stop: float = 0.08
     """tau, on the scale of L_recon: 0.08 is 22 dB."""
     trees: int = 3
@@ -192,7 +192,7 @@ class Pool:
 
     def loss(self, stop: float) -> float:
         """Sum of the criterion over its nodes; smaller trees lose less."""
-        split = [part.terms.select for part in self.parts if part.state == "split" and part.terms]
+        split = [part.terms.rank for part in self.parts if part.state == "split" and part.terms]
         return sum(split) + stop * len(self.left_over)
 
 
@@ -351,7 +351,7 @@ def _splits(parts: Sequence[Part], networks: Networks, settings: Inference, gene
     for number, part in enumerate(parts):
         rows = range(number * settings.samples, (number + 1) * settings.samples)
         best: dict[tuple[str, ...], int] = {}
-        for row in sorted(rows, key=lambda row: (drawn.terms[row].select, row)):
+        for row in sorted(rows, key=lambda row: (drawn.terms[row].rank, row)):
             best.setdefault((drawn.operators[row], *drawn.kinds[row]), row)
         found.append([_split_of(part, drawn, row, settings) for row in list(best.values())[: settings.choices]])
     return found
