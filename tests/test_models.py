@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -135,6 +136,19 @@ def test_sampling_with_the_cache_draws_the_same_codes(temperature: float, at_onc
         assert torch.equal(fast.bottom, slow.bottom)
     if temperature == 1.0:
         assert drawn[0][0].bottom.unique().numel() > 4
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 14), reason="PyTorch has no TorchScript for this Python")
+def test_codes_are_drawn_without_the_interpreter() -> None:
+    assert isinstance(sampling.compiled(), torch.jit.ScriptFunction)
+
+
+def test_where_there_is_no_torchscript_codes_are_drawn_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise RuntimeError("TorchScript is gone")
+
+    monkeypatch.setattr(torch.jit, "script", refused)
+    assert sampling.compiled.__wrapped__() is sampling.draw
 
 
 @pytest.mark.parametrize("count", [1, 7, 12])

@@ -84,8 +84,9 @@ class Inference:
     remainders: bool = True
     """Give a child that is to be decomposed what its sibling leaves of the parent (`remainders`), not what was decoded for it alone."""
     hidden: float = 0.01
-    """A part that changes the picture by less than this, root mean square, against one colour is one colour. 0 for none, and for the
-    order of the pools in the place of what shows most."""
+    """A part that changes the picture by less than this, root mean square, against one colour is one colour."""
+    seen_first: bool = True
+    """Draw for those first that show most, not in the order of the pools."""
 
 
 Cause = Literal["loss", "depth", "nodes", "draws"]
@@ -262,7 +263,7 @@ def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> I
     while any(pool.open for pool in pools):
         # Pools share their upper parts, which are drawn for once.
         parts = list({id(pool.parts[place]): pool.parts[place] for pool in pools for place in pool.open}.values())
-        if settings.hidden:
+        if settings.seen_first:
             parts.sort(key=lambda part: -part.shown)
         parts = parts[: settings.draws - drawn]
         if not parts:

@@ -157,8 +157,11 @@ def draw(state: State, entries: Tensor, chances: Tensor, temperature: float) -> 
 
 @lru_cache(maxsize=1)
 def compiled() -> Callable[[State, Tensor, Tensor, float], Tensor]:
-    """`draw` as TorchScript."""
+    """`draw` as TorchScript, or as it is where PyTorch does not offer that any more: the same codes, in twice the time or more."""
     with warnings.catch_warnings():
         # What PyTorch offers in its place, torch.compile, wants a C++ compiler on the user's machine.
         warnings.simplefilter("ignore", DeprecationWarning)
-        return cast(Callable[[State, Tensor, Tensor, float], Tensor], torch.jit.script(draw))
+        try:
+            return cast(Callable[[State, Tensor, Tensor, float], Tensor], torch.jit.script(draw))
+        except RuntimeError:
+            return draw
