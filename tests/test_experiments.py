@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import re
 from collections.abc import Iterator
@@ -120,6 +121,32 @@ def test_what_is_done_is_not_done_again(tmp_path: Path, data: Path, folder: Path
     assert not done
     run(dataclasses.replace(asked, resume=False), Console(quiet=True))
     assert len(done) == len(first["rows"])
+
+
+def test_methods_are_added_to_what_is_there(tmp_path: Path, data: Path, folder: Path) -> None:
+    first = options(tmp_path, data, folder, "cnn", "lstm", parts=("robustness", "wild"))
+    before = run(first, Console(quiet=True)).documents
+    picture = (first.figures / "wild.png").read_bytes()
+    said = Console(file=io.StringIO(), width=200)
+    more = dataclasses.replace(first, methods=("lstm", "transformer"), add=True)
+    after = run(more, said).documents
+    for part in first.parts:
+        kept = [row for row in before[part]["rows"] if row["method"] == "cnn"]
+        assert kept and [row for row in after[part]["rows"] if row["method"] == "cnn"] == kept
+        assert [row["method"] for row in after[part]["summary"]].count("transformer") == len(kept)
+        assert {(row["method"], row["dataset"]) for row in after[part]["summary"]} >= {(row["method"], row["dataset"]) for row in kept}
+        assert len(after[part]["rows"]) == len(before[part]["rows"]) * 3 // 2
+        assert set(after[part]["weights"]) == {"cnn", "lstm", "transformer"}
+        assert after[part]["notes"] == ["Measured last: `lstm`, `transformer`; the other methods are of an earlier run."]
+        assert json.loads((first.results / f"{part}.json").read_text()) == after[part]
+    # Trees of the earlier run are not kept, so its picture stays.
+    assert (first.figures / "wild.png").read_bytes() == picture and "not drawn: wild.png; trees of cnn" in said.file.getvalue()
+    assert run(more, Console(quiet=True)).documents == after
+    with pytest.raises(UnshadeError, match="limit 1, not 2; leave out --add"):
+        run(dataclasses.replace(more, limit=2), Console(quiet=True))
+    (first.results / "wild.json").write_text('{"format": 1')
+    with pytest.raises(UnshadeError, match=r"wild\.json is not JSON"):
+        run(more, Console(quiet=True))
 
 
 def test_other_weights_are_another_method(tmp_path: Path, folder: Path) -> None:

@@ -151,7 +151,7 @@ def test_where_there_is_no_torchscript_codes_are_drawn_all_the_same(monkeypatch:
     assert sampling.compiled.__wrapped__() is sampling.draw
 
 
-@pytest.mark.parametrize("count", [1, 7, 12])
+@pytest.mark.parametrize("count", [1, 9, 13])
 def test_threads_share_the_maps_and_draw_the_same_codes(count: int) -> None:
     """In TorchScript and, as on a GPU, without it."""
     net = PixelSNAIL(4, 16, 8, DRAWN.prior).double().eval()
@@ -159,7 +159,9 @@ def test_threads_share_the_maps_and_draw_the_same_codes(count: int) -> None:
 
     def drawn(shared: int) -> torch.Tensor:
         with threads(shared):
-            return net.sample(entries, condition, torch.Generator().manual_seed(7))
+            found = net.sample(entries, condition, torch.Generator().manual_seed(7))
+            assert torch.get_num_threads() == shared
+        return found
 
     alone = drawn(1)
     assert alone.shape == (count, 4, 4) and alone.unique().numel() > 4

@@ -31,6 +31,7 @@ class ExperimentsError(UnshadeError):
 )
 @click.option("--limit", type=click.IntRange(1), metavar="N", help="Pictures of each set, and analogies of each component.")
 @click.option("--resume/--fresh", default=True, help="Keep what an earlier run has measured (the default), or measure again.")
+@click.option("--add", is_flag=True, help="Keep what the JSON that is there says of methods that are not asked now.")
 @click.option(
     "--data",
     type=click.Path(path_type=Path, file_okay=False, exists=True),
@@ -60,6 +61,7 @@ def experiments(
     methods: tuple[str, ...],
     limit: int | None,
     resume: bool,
+    add: bool,
     data: Path | None,
     weights: Path | None,
     training: Path | None,
@@ -88,6 +90,7 @@ def experiments(
       unshade experiments
       unshade experiments decomposition anytime --limit 4
       unshade experiments analogy --method search:balanced --method lstm --weights run/weights
+      unshade experiments ablation anytime --method learned --add
     """
     from unshade.experiments import Options, run
     from unshade.experiments.options import METHODS
@@ -98,7 +101,7 @@ def experiments(
         if "ablation" in given:
             raise click.UsageError("ablation takes the method learned apart, which is not among those of --method; add --method learned")
         parts = tuple(part for part in parts if part != "ablation")
-    ran = run(Options(parts, methods, data, output, limit, weights, training, seed, workers, perceptual, resume))
+    ran = run(Options(parts, methods, data, output, limit, weights, training, seed, workers, perceptual, resume, add))
     if ran.failed:
         raise ExperimentsError(f"{len(ran.failed)} measurements failed; the first: {ran.failed[0]}")
 

@@ -64,7 +64,8 @@ def criterion(
         rebuilt = torch.stack([BLENDS[name].apply(*pair, *([masks] if name == "mix" else [])) for name in OPERATORS])
         return _distance(parents, rebuilt[operators, torch.arange(len(operators), device=operators.device)], disc)
 
-    recon, at_first = missed(through), missed(drawn)
+    recon = missed(through)
+    at_first = recon if drawn is through else missed(drawn)
     mixed = operators == OPERATORS.index("mix")
 
     def near(other: Image, ignored: torch.Tensor | None = None) -> torch.Tensor:

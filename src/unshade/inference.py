@@ -25,7 +25,7 @@ below the depth limit. Where the paper's text has slips, or says less than a pro
 - Distances are root mean squares inside the disc, so that alpha, beta, gamma and tau do not depend on the size of the pictures.
 - g's mask is used as soft as it comes, because our Toon trees hold ramps; the paper's masks are 0 or 1.
 - All open nodes of a pool are one batch, not one node after the other. `Inference.trees` pools are kept side by side (the paper
-  keeps one), ordered by the sum of their losses, tau for each node left over.
+  keeps one), ordered by the sum of what their samples were ordered by, tau for each node left over.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ class Pool:
         return found[::-1]
 
     def loss(self, stop: float) -> float:
-        """Sum of the criterion over its nodes; smaller trees lose less."""
+        """Sum of `Terms.rank` over its nodes, ``stop`` for each that is left over; smaller trees lose less."""
         split = [part.terms.rank for part in self.parts if part.state == "split" and part.terms]
         return sum(split) + stop * len(self.left_over)
 
@@ -352,7 +352,8 @@ def _splits(parts: Sequence[Part], networks: Networks, settings: Inference, gene
     for number, part in enumerate(parts):
         rows = range(number * settings.samples, (number + 1) * settings.samples)
         best: dict[tuple[str, ...], int] = {}
-        for row in sorted(rows, key=lambda row: (drawn.terms[row].rank, row)):
+        # One that tau would refuse comes last, however well it was drawn.
+        for row in sorted(rows, key=lambda row: (drawn.terms[row].select > settings.stop, drawn.terms[row].rank, row)):
             best.setdefault((drawn.operators[row], *drawn.kinds[row]), row)
         found.append([_split_of(part, drawn, row, settings) for row in list(best.values())[: settings.choices]])
     return found

@@ -49,7 +49,7 @@ OFFERED = 4
 """Changes of a proposal that are looked at closely."""
 
 REMOVED = 5
-"""Leaves whose loss is looked at closely, those that are missed least at once."""
+"""Leaves whose loss is looked at closely: those with the least error before any fit."""
 
 SecondStageName = Literal["size", "depth", "none"]
 

@@ -64,7 +64,7 @@ class SecondStage:
         self.count = 0
         """Fits of whole structures."""
         self.known: dict[tuple[Image, int], Node] = {}
-        """The trees of pictures with so much room: pools share many of the nodes that they leave over."""
+        """The trees of pictures with room for so many values: pools share many of the nodes that they leave over."""
 
     def decompose(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node:
         """The tree of a node that was left over: of the picture itself where it is the root, else of the node's own."""
@@ -110,10 +110,10 @@ class SecondStageByDepth(SecondStage):
 
     def decompose(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node:
         """See the class."""
-        image, valid = self.image, self.valid
-        if place:
-            image = pool.parts[place].image.cpu()
-            valid = disc_mask(image.shape[-1])
+        key = (pool.parts[place].image, ALBEDO)
+        if key in self.known:
+            return self.known[key]
+        image, valid = (key[0].cpu(), disc_mask(key[0].shape[-1])) if place else (self.image, self.valid)
         found = self.main.start()
         with torch.inference_mode(False):
             for progress in search_depth.search(
@@ -128,6 +128,7 @@ class SecondStageByDepth(SecondStage):
             ):
                 found = progress.root
             self.count += progress.done
+        self.known[key] = found
         return found
 
     def in_place(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node | None:

@@ -284,7 +284,10 @@ def _ahead(batches: Dataset[Any], first: int, workers: int) -> DataLoader[Any]:
 
 
 def _ends_at_once(worker: int) -> None:
-    """Let this worker leave without taking its interpreter apart, which aborts it where a thread still packs a batch."""
+    """Let this worker leave without taking its interpreter apart, which aborts it where a thread still packs a batch.
+
+    What fails in a worker is not told by its exit, but raised where its batch is asked for.
+    """
     atexit.register(os._exit, 0)
 
 

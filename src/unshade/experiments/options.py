@@ -37,6 +37,8 @@ class Options:
     perceptual: bool = True
     resume: bool = True
     """Keep what the journal holds."""
+    add: bool = False
+    """Keep what the documents that are there say of methods that are not asked."""
 
     @property
     def results(self) -> Path:

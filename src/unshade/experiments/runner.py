@@ -13,7 +13,7 @@ from rich.console import Console
 from unshade.bench.options import cores
 from unshade.bench.report import machine, versions
 from unshade.errors import MissingExtraError, OutputError, UnshadeError, did_you_mean
-from unshade.experiments import methods, plots, sheets
+from unshade.experiments import addition, methods, plots, sheets
 from unshade.experiments.jobs import Work
 from unshade.experiments.options import Options
 from unshade.experiments.page import page
@@ -66,6 +66,7 @@ def run(options: Options, console: Console | None = None) -> Ran:
     measured = _perceptual(options, ran)
     for name, why in ran.skipped.items():
         tell(f"skipped {name}: {why}")
+    earlier = {part: _earlier(options, part) for part in options.parts}
     work = Work(options.journal, options.workers or cores(), options.resume, console)
     for part in options.parts:
         tell(f"{part}: {', '.join(able)}")
@@ -75,24 +76,37 @@ def run(options: Options, console: Console | None = None) -> Ran:
         failed = work.failed[before:]
         for what in [*(f"skipped {name}: {why}" for name, why in context.skipped.items()), *(f"failed: {what}" for what in failed)]:
             tell(what)
-        head: Document = {
-            "format": FORMAT,
-            "part": part,
-            "seed": options.seed,
-            "limit": options.limit,
-            "machine": machine(),
-            "versions": versions(),
-        }
-        head |= {"weights": methods.cards(iter(able), options.weights), "skipped": ran.skipped | context.skipped, "failed": failed}
-        ran.documents[part] = head | document
+        head = _head(options, part) | {"machine": machine(), "versions": versions(), "weights": methods.cards(iter(able), options.weights)}
+        head |= {"skipped": ran.skipped | context.skipped, "failed": failed}
+        old = earlier[part]
+        ran.documents[part], kept = addition.added(head | document, old) if old is not None else (head | document, [])
         ran.failed += failed
         _write(options.results / f"{part}.json", _lines(ran.documents[part]))
-        if part in sheets.SHEETS:
+        if part in sheets.SHEETS and kept:
+            tell(f"not drawn: {part}.png; trees of {', '.join(kept)} are not in the earlier document")
+        elif part in sheets.SHEETS:
             sheets.SHEETS[part](options, rows)
         _draw(lambda part=part: _plot(options, part, ran.documents[part]), tell)  # type: ignore[misc]
         _learning(options, tell)
         write_page(options)
     return ran
+
+
+def _head(options: Options, part: str) -> Document:
+    return {"format": FORMAT, "part": part, "seed": options.seed, "limit": options.limit}
+
+
+def _earlier(options: Options, part: str) -> Document | None:
+    """What is there of a part. Raises UnshadeError where nothing can be added to it."""
+    path = options.results / f"{part}.json"
+    if not options.add or not path.is_file():
+        return None
+    try:
+        old: Document = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UnshadeError(f"{path} is not JSON ({error}); leave out --add to measure anew") from None
+    addition.check(old, _head(options, part), str(path))
+    return old
 
 
 def _lines(document: Document) -> str:

@@ -23,12 +23,12 @@ AT_ONCE = 128
 """Maps that a CPU draws as one batch: 1.5 MB are kept of each in the small configuration, and more at once are not faster there."""
 
 OF_A_THREAD = 4
-"""Maps from which on a second thread draws a part of them."""
+"""Fewest maps that are worth a thread of their own."""
 
 
 def _norm(x: Tensor, gain: Tensor) -> Tensor:
     """Root mean square ``gain`` across the channels, dimension 1 of (B, C, H, W), at each position alone: so it is causal."""
-    return F.normalize(x, dim=1) * _scaled(gain).view(-1, 1, 1)
+    return sampling.unit(x) * _scaled(gain).view(-1, 1, 1)
 
 
 def _scaled(gain: Tensor) -> Tensor:
@@ -188,12 +188,14 @@ class PixelSNAIL(nn.Module):
         Returns:
             (N, H, W) int64.
         """
+        condition = condition.to(self.gain.dtype)
         parts = _parts(condition, _chances(condition, self.size**2, generator))
         draw = sampling.compiled() if condition.device.type == "cpu" else sampling.draw
 
-        @torch.inference_mode()
         def drawn(part: Tensor, chances: Tensor) -> Tensor:
-            return draw(self.begun(part, entries), entries, chances, temperature).unflatten(1, (self.size, self.size))
+            # Both belong to a thread.
+            with torch.inference_mode(), torch.autocast(part.device.type, enabled=False):
+                return draw(self.begun(part, entries), entries, chances, temperature).unflatten(1, (self.size, self.size))
 
         return torch.cat(_at_once([partial(drawn, *part) for part in parts], condition.device))
 
@@ -262,7 +264,10 @@ def _parts(condition: Tensor, chances: Sequence[Tensor]) -> list[tuple[Tensor, T
 
 
 def _at_once(jobs: Sequence[Callable[[], Tensor]], device: torch.device) -> list[Tensor]:
-    """The answers of all jobs, on a CPU each computed by a thread of its own: twice as fast as one job after the other by two threads."""
+    """The answers of all jobs, on a CPU each computed by a thread of its own: twice as fast as one job after the other by two threads.
+
+    An interrupt waits for those that have begun, a second or three.
+    """
     count = min(torch.get_num_threads(), len(jobs)) if device.type == "cpu" else 1
     if count == 1:
         return [job() for job in jobs]

@@ -5,6 +5,7 @@ part of Python that is TorchScript too, and on a CPU runs as that: no interprete
 thread.
 """
 
+import sys
 import warnings
 from collections.abc import Callable
 from functools import lru_cache
@@ -13,6 +14,9 @@ from typing import NamedTuple, cast
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+NO_SCRIPT = (3, 14)
+"""From this Python on, PyTorch does not support TorchScript."""
 
 
 class Convolution(NamedTuple):
@@ -72,8 +76,13 @@ class State(NamedTuple):
     """(L, 2)."""
 
 
+def unit(x: Tensor) -> Tensor:
+    """Features (N, C, ...) divided by their length, or by a thousandth of the usual one where they have none."""
+    return F.normalize(x, dim=1, eps=1e-3 * x.size(1) ** 0.5)
+
+
 def _normal(x: Tensor, gain: Tensor) -> Tensor:
-    return F.elu(F.normalize(x, dim=1) * gain)
+    return F.elu(unit(x) * gain)
 
 
 def _convolved(layer: Convolution, row: int, column: int, x: Tensor, bias: Tensor) -> Tensor:
@@ -90,7 +99,7 @@ def _gated(layer: Layer, row: int, column: int, position: int, x: Tensor, aside:
 
 
 def _asked(attention: Attention, x: Tensor, place: Tensor) -> Tensor:
-    return torch.cat([F.normalize(x, dim=1) * attention.gain, place.expand(x.size(0), 2)], 1)
+    return torch.cat([unit(x) * attention.gain, place.expand(x.size(0), 2)], 1)
 
 
 def _looked(attention: Attention, position: int, asked: Tensor) -> Tensor:
@@ -162,6 +171,7 @@ def compiled() -> Callable[[State, Tensor, Tensor, float], Tensor]:
         # What PyTorch offers in its place, torch.compile, wants a C++ compiler on the user's machine.
         warnings.simplefilter("ignore", DeprecationWarning)
         try:
-            return cast(Callable[[State, Tensor, Tensor, float], Tensor], torch.jit.script(draw))
-        except RuntimeError:
-            return draw
+            script = torch.jit.script(draw) if sys.version_info < NO_SCRIPT else draw
+        except (RuntimeError, AttributeError, OSError):  # a later PyTorch without it, or no source to read
+            script = draw
+    return cast(Callable[[State, Tensor, Tensor, float], Tensor], script)
