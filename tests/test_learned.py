@@ -18,15 +18,16 @@ import torch
 
 from unshade import batch, decoded, inference, learned, search_depth, second_stage, synthesis
 from unshade.cli import run as run_command
-from unshade.criterion import Terms, criterion
+from unshade.criterion import Terms
 from unshade.decompose import Result, decompose, fit
 from unshade.errors import MissingWeightsError, TreeError, UnshadeError
 from unshade.fit.pixels import Pixels
 from unshade.grammar import same_structure
-from unshade.inference import Inference, Networks, Part, Pool, Round, infer, node_image
+from unshade.inference import Inference, Networks, Part, Pool, Round, infer
 from unshade.models import weights
 from unshade.models.config import find
 from unshade.models.vqvae import Codes
+from unshade.node_image import node_image
 from unshade.nodes import Leaf, Node, Operator, Tree, count_values, leaf, mix, multiply, screen, walk
 from unshade.parameters import Layout
 from unshade.pictures import write_picture
@@ -205,56 +206,6 @@ def test_several_pools_differ_and_the_best_comes_first(networks: Networks) -> No
     losses = [pool.loss(settings.stop) for pool in found]
     assert losses == sorted(losses)
     assert len({tuple((part.kind, part.operator) for part in pool.parts) for pool in found}) == len(found)
-
-
-def terms(
-    parent: torch.Tensor,
-    left: torch.Tensor,
-    right: torch.Tensor,
-    operator: str,
-    mask: torch.Tensor | None = None,
-    drawn: tuple[torch.Tensor, torch.Tensor] | None = None,
-) -> Terms:
-    masks = torch.zeros(1, 1, SIZE, SIZE) if mask is None else mask[None]
-    number = torch.tensor([synthesis.OPERATORS.index(operator)])
-    children = left[None], right[None]
-    first = children if drawn is None else (drawn[0][None], drawn[1][None])
-    return criterion(parent[None], parent[None], first, children, children, number, masks, (0.02, 0.02, 0.02, 0.5))[0]
-
-
-def test_the_criterion_of_a_right_decomposition_is_nothing() -> None:
-    disc = disc_mask(SIZE)
-    left, right = (picture(child, SIZE) * disc for child in SIMPLE.children)
-    found = terms(picture(SIMPLE, SIZE) * disc, left, right, "screen")
-    assert found.recon == pytest.approx(0.0, abs=1e-6)
-    assert found.similar == found.blank == found.white == 0.0
-
-
-def test_of_two_that_explain_a_node_alike_the_one_that_was_drawn_right_is_better() -> None:
-    disc = disc_mask(SIZE)
-    parent = picture(SIMPLE, SIZE) * disc
-    left, right = (picture(child, SIZE) * disc for child in SIMPLE.children)
-    good, bad = (terms(parent, left, right, "screen", drawn=(first, right)) for first in (left * 0.99, left * 0.6))
-    assert good.recon == bad.recon < 1e-6 and 0.0 < good.drawn < bad.drawn
-    assert bad.select == good.select == good.recon and bad.rank - good.rank == pytest.approx(0.5 * (bad.drawn - good.drawn), abs=1e-6)
-
-
-def test_one_useless_child_is_enough_to_cost() -> None:
-    disc = disc_mask(SIZE)
-    parent = picture(SIMPLE, SIZE) * disc
-    black, white = torch.zeros_like(parent), disc.expand(3, -1, -1).float()
-    blank, copied = terms(parent, parent, black, "screen"), terms(parent, parent, white, "multiply")
-    assert blank.recon < 1e-6 and blank.blank > 1.0 and blank.similar > 1.0
-    assert copied.recon < 1e-6 and copied.white > 1.0 and copied.similar > 1.0
-    assert blank.select > 0.05 and copied.select > 0.05
-
-
-def test_black_and_white_paint_is_welcome_in_a_mix() -> None:
-    disc = disc_mask(SIZE)
-    mask = disc & (sphere_normals(SIZE)[:1] > 0)
-    black, white = torch.zeros(3, SIZE, SIZE), disc.expand(3, -1, -1).float()
-    found = terms(mask.expand(3, -1, -1).float(), white, black, "mix", mask.float())
-    assert found.recon < 1e-6 and found.select < 1e-6
 
 
 @pytest.mark.parametrize("size", [16, 64, 200])

@@ -16,11 +16,11 @@ import torch
 
 from unshade.decoded import leaf_of, mask_of
 from unshade.errors import UnshadeError, did_you_mean
-from unshade.inference import node_image
 from unshade.models import weights
 from unshade.models.cnn_baseline import CNNBaseline
 from unshade.models.token_model import TokenModel
 from unshade.models.tokens import tree_of
+from unshade.node_image import node_image
 from unshade.nodes import Node, Operator, Tree
 from unshade.pictures import SphereImage
 from unshade.proposals import arranged

@@ -27,7 +27,8 @@ from unshade.fit.least_squares import FINE_SOFTNESS, error_of, fit_pixels
 from unshade.fit.model import soften
 from unshade.fit.pixels import Pixels
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
-from unshade.inference import Cause, Inference, Networks, Pool, Round, infer, node_image
+from unshade.inference import Cause, Inference, Networks, Pool, Round, infer
+from unshade.node_image import node_image
 from unshade.nodes import Node, count_values
 from unshade.proposals import Fits
 from unshade.search import Search

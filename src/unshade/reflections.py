@@ -23,10 +23,10 @@ from unshade.circles import edge_circles, edges_left, masks_of
 from unshade.fit.least_squares import COARSE_SIZE, fit_pixels
 from unshade.fit.pixels import Pixels
 from unshade.growth import Candidate, Effort, Growth, Samples
-from unshade.inference import node_image
 from unshade.models import weights
 from unshade.models.reflection import ReflectionNet
 from unshade.moves import add_light
+from unshade.node_image import node_image
 from unshade.nodes import KINDS, Leaf, Node, Operator, Raster, leaf, walk
 from unshade.pictures import SphereImage
 from unshade.pixel_sets import grain
