@@ -129,7 +129,12 @@ def test_methods_are_added_to_what_is_there(tmp_path: Path, data: Path, folder: 
     picture = (first.figures / "wild.png").read_bytes()
     said = Console(file=io.StringIO(), width=200)
     more = dataclasses.replace(first, methods=("lstm", "transformer"), add=True)
+    spoilt = json.loads((first.results / "wild.json").read_text()) | {
+        "failed": ["cnn on wild/ball: out of memory", "lstm on wild/ball: killed"]
+    }
+    (first.results / "wild.json").write_text(json.dumps(spoilt))
     after = run(more, said).documents
+    assert after["wild"]["failed"] == ["cnn on wild/ball: out of memory"]
     for part in first.parts:
         kept = [row for row in before[part]["rows"] if row["method"] == "cnn"]
         assert kept and [row for row in after[part]["rows"] if row["method"] == "cnn"] == kept

@@ -110,7 +110,7 @@ class SecondStageByDepth(SecondStage):
 
     def decompose(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node:
         """See the class."""
-        key = (pool.parts[place].image, ALBEDO)
+        key = (pool.parts[place].image, NODE_EFFORT.max_values)
         if key in self.known:
             return self.known[key]
         image, valid = (key[0].cpu(), disc_mask(key[0].shape[-1])) if place else (self.image, self.valid)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from unshade.errors import UnshadeError
-
-Document = dict[str, Any]
-Entry = dict[str, Any]
+from unshade.experiments.jobs import Row
+from unshade.experiments.parts import Document
 
 WHICH = ("dataset", "name", "component", "damage", "method")
 """What an entry is of; those that it has tell it from all others of its list."""
@@ -22,7 +21,7 @@ def check(old: Document, new: Document, name: str) -> None:
 
 def added(new: Document, old: Document) -> tuple[Document, list[str]]:
     """The new document with what the old one says of other methods, and those methods. A note says which are whose."""
-    lists = [field for field, value in new.items() if isinstance(value, list) and all(isinstance(entry, dict) for entry in value)]
+    lists = [field for field, value in new.items() if isinstance(value, list) and field not in ("failed", "notes")]
     fresh = {entry["method"] for field in lists for entry in new[field]}
     kept = sorted({entry["method"] for field in lists for entry in old.get(field, [])} - fresh)
     if not kept:
@@ -36,15 +35,17 @@ def added(new: Document, old: Document) -> tuple[Document, list[str]]:
             found["notes"] = notes
     found["weights"] = old.get("weights", {}) | new["weights"]
     found["skipped"] = {what: why for what, why in (old.get("skipped", {}) | new["skipped"]).items() if what not in fresh}
+    # A failure begins with its method (`jobs.Work.measure`).
+    found["failed"] = [*(what for what in old.get("failed", []) if what.partition(" on ")[0] not in fresh), *new["failed"]]
     return found, kept
 
 
-def _joined(new: list[Entry], old: list[Entry], fresh: set[str]) -> list[Entry]:
+def _joined(new: list[Row], old: list[Row], fresh: set[str]) -> list[Row]:
     """In the order of the old list; what that has not comes last."""
     again = {_which(entry): entry for entry in new}
     kept = [again.pop(_which(entry), None) if entry["method"] in fresh else entry for entry in old]
     return [*(entry for entry in kept if entry is not None), *again.values()]
 
 
-def _which(entry: Entry) -> tuple[Any, ...]:
+def _which(entry: Row) -> tuple[Any, ...]:
     return tuple(entry.get(field) for field in WHICH)

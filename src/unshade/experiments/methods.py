@@ -114,7 +114,9 @@ def _settings(method: str) -> tuple[Any, ...]:
     name = name_of(method)
     preset = PRESETS[name.argument] if name.argument in PRESETS else PRESETS["balanced"] if name.kind in ("search", *NETWORKS) else None
     networks = {"learned": VARIANTS.get(name.argument or "full"), "hybrid": learned.PROPOSED}.get(name.kind)
-    fixed = (learned.PLACED_STEPS, learned.WHOLE_STEPS, learned.SURVIVORS, second_stage.NODE_EFFORT) if name.kind == "learned" else ()
+    fixed: tuple[Any, ...] = ()
+    if name.kind == "learned":
+        fixed = (learned.PLACED_STEPS, learned.WHOLE_STEPS, learned.SURVIVORS, learned.REMOVED, second_stage.NODE_EFFORT)
     return preset, networks, fixed
 
 

@@ -264,7 +264,7 @@ def _ablation(document: Document) -> Iterator[str]:
         "`learned:base` draws one sample a node and nothing else; `samples` draws several, picks by the criterion and keeps\n"
         "three trees side by side; `second` adds the second stage for the nodes left over; `overall` adds the optimisation of the\n"
         "whole tree, the last of the paper's stages; `learned` looks at nodes left over again in their place in the tree, which is\n"
-        "ours and the default. All of them complete children by what their siblings leave of the picture (learned.md)."
+        "ours and the default. All of them complete children by what their siblings leave of the picture ([learned](learned.md))."
     )
     yield ""
     short = [column for column in COLUMNS if column[0] in ("psnr", "ssim", "st_lpips", "values", "structure", "cpu_seconds")]
