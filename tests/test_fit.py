@@ -11,8 +11,9 @@ import torch
 from unshade.decompose import fit
 from unshade.errors import AddressError
 from unshade.fit.least_squares import error_of, fit_least_squares, fit_pixels, place_edges, sharpen
-from unshade.fit.model import Model, is_hard, soften
+from unshade.fit.model import Model, soften
 from unshade.fit.pixels import Pixels
+from unshade.fit.plan import is_hard
 from unshade.grammar import same_structure
 from unshade.metrics import psnr
 from unshade.nodes import KINDS, Kind, Leaf, Node, Parameter, Raster, Role, Tree, find, leaf, mix, multiply, register, replace, screen, walk

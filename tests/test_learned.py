@@ -414,25 +414,6 @@ def test_what_several_pools_leave_over_is_decomposed_once() -> None:
     assert stage.count > fits and count_values(smaller) < count_values(first)
 
 
-@pytest.mark.parametrize("looked_at", [1, 5])
-def test_the_leaf_that_is_missed_least_goes_first(looked_at: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learned, "REMOVED", looked_at)
-    faint = leaf("highlight", direction=(0.5, 0.2, 0.85), sharpness=20.0, amplitude=0.05)
-    root = screen(SIMPLE, faint)
-    pixels = Pixels.of(picture(root), None, 40)
-    smaller = learned.least_useful(root, pixels)
-    assert smaller is not None and sorted(entry.kind for entry in _leaves(smaller)) == ["albedo", "diffuse", "highlight"]
-    assert min(float(entry["amplitude"][0]) for entry in _leaves(smaller) if entry.kind == "highlight") > 0.5
-    for most in (11, 4):  # over by less than twelve values, and by more
-        left = learned.within(screen(root, faint), pixels, most)
-        assert left is not None and count_values(left) <= most
-    assert learned.least_useful(leaf("albedo"), pixels) is None
-
-
-def _leaves(root: Node) -> list[Leaf]:
-    return [node for _, node in walk(root) if isinstance(node, Leaf)]
-
-
 def test_looking_at_a_node_in_its_place_mends_what_was_decoded_badly(monkeypatch: pytest.MonkeyPatch) -> None:
     class Blurred(Oracle):
         def __init__(self, root: Node) -> None:

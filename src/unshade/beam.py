@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 
-from unshade.fit.model import EDGE
+from unshade.fit.plan import EDGE
 from unshade.growth import Candidate
 from unshade.moves import Anatomy, plain_numbers
 from unshade.nodes import KINDS, Leaf, Node, find, walk

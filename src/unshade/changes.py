@@ -11,18 +11,23 @@ from unshade.nodes import KINDS, Leaf, Node, Operator, find, leaf, mix, multiply
 
 def removals(root: Node) -> list[Node]:
     """Every tree that has one light, form or paint less."""
+    return [replace(root, address, kept) for address, kept in removable(root)]
+
+
+def removable(root: Node) -> list[tuple[str, Node | None]]:
+    """What `removals` takes out: an address, and what stands there instead, None for nothing."""
     parts = Anatomy.of(root)
-    found = []
+    found: list[tuple[str, Node | None]] = []
     for address, node in walk(root):
         parent = address.rsplit(".", 2)
         if len(parent) == 3 and parent[2] != "mask" and parent[0].rpartition(".")[2] in ("screen", "multiply"):
             inside_pair = tint(find(root, parent[0])) is not None and parent[0] != parts.base
             if address != parts.base and not inside_pair and not (is_paint(node) and parent[0] == parts.base):
-                found.append(replace(root, address, None))
+                found.append((address, None))
         if isinstance(node, Operator) and node.kind == "mix":
-            found += [replace(root, address, child) for child in node.children]
+            found += [(address, child) for child in node.children]
         if isinstance(node, Leaf) and node.kind == "environment" and node.lobes > 1:
-            found += [replace(root, address, _without_lobe(node, k)) for k in range(node.lobes)]
+            found += [(address, _without_lobe(node, k)) for k in range(node.lobes)]
     return found
 
 

@@ -17,8 +17,9 @@ from functools import cached_property
 
 from unshade.atoms import Dictionary
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
-from unshade.fit.model import NO_LIMITS, Limits, Model
+from unshade.fit.model import Model
 from unshade.fit.pixels import Pixels
+from unshade.fit.plan import NO_LIMITS, Limits
 from unshade.moves import Move, Proposer
 from unshade.nodes import Leaf, Node, count_values, leaf
 

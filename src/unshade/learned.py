@@ -25,12 +25,12 @@ import torch
 from unshade.changes import removals, swaps
 from unshade.fit.least_squares import FINE_SOFTNESS, error_of, fit_pixels
 from unshade.fit.model import soften
-from unshade.fit.pixels import Pixels
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
 from unshade.inference import Cause, Inference, Networks, Pool, Round, infer
 from unshade.node_image import node_image
 from unshade.nodes import Node, count_values
 from unshade.proposals import Fits
+from unshade.pruning import least_useful, within
 from unshade.search import Search
 from unshade.search_drawn import DRAWN, SETTLED, settled
 from unshade.second_stage import SecondStage, SecondStageByDepth
@@ -48,9 +48,6 @@ SURVIVORS = 2
 
 OFFERED = 4
 """Changes of a proposal that are looked at closely."""
-
-REMOVED = 5
-"""Leaves whose loss is looked at closely: those with the least error before any fit."""
 
 SecondStageName = Literal["size", "depth", "none"]
 
@@ -359,21 +356,3 @@ class Unproposed(Search):
     def __init__(self, samples: Samples, effort: Effort, why: str) -> None:
         super().__init__(samples, effort)
         self.stages = Stages("search", why)
-
-
-def least_useful(root: Node, pixels: Pixels, steps: int = 3) -> Node | None:
-    """The tree without the leaf whose loss hurts least after so many steps of a fit; None where only one is left."""
-    options = sorted(((error_of(pixels, smaller), k, smaller) for k, smaller in enumerate(removals(root))), key=lambda option: option[:2])
-    if not options or not steps:
-        return options[0][2] if options else None
-    close = [fit_pixels(pixels, smaller, steps=steps, softest=FINE_SOFTNESS) for _, _, smaller in options[:REMOVED]]
-    return min(close, key=lambda option: option.error).root
-
-
-def within(root: Node, pixels: Pixels, most: int) -> Node | None:
-    """The tree without its least useful leaves until it stores at most so many values; None where that cannot be."""
-    found: Node | None = root
-    while found is not None and (over := count_values(found) - most) > 0:
-        # A tree that is far too large is full of leaves that nothing rests on.
-        found = least_useful(found, pixels, steps=3 if over < 12 else 0)
-    return found

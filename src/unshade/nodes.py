@@ -559,9 +559,9 @@ def walk(root: Node) -> Iterator[tuple[str, Node]]:
 
 def find_address(root: Node, where: str) -> str:
     """The full address for an address, an address without its last kind, a name, or the kind of a single node."""
-    known = dict(walk(root))
-    if where in known:
+    if _at(root, where) is not None:
         return where
+    known = dict(walk(root))
     without_kind = where if where[-1:].isdigit() else None
     matches = [address for address, node in known.items() if node.name == where or address.rpartition(".")[0] == without_kind]
     matches = matches or [address for address, node in known.items() if node.kind == where]
@@ -573,9 +573,23 @@ def find_address(root: Node, where: str) -> str:
     raise AddressError(f"no node {where!r}{did_you_mean(where, [*known, *names])}")
 
 
+def _at(root: Node, address: str) -> Node | None:
+    """The node at a full address; None where there is none."""
+    kind, *path = address.split(".")
+    node: Node | None = root if root.kind == kind else None
+    while path and node is not None:
+        step = path.pop(0)
+        node = dict(steps(node)).get(step)
+        if step != "mask" and (node is None or not path or node.kind != path.pop(0)):
+            return None
+    return node
+
+
 def find(root: Node, where: str) -> Node:
     """The node at an address or of a name. Raises AddressError."""
-    return dict(walk(root))[find_address(root, where)]
+    found = _at(root, find_address(root, where))
+    assert found is not None
+    return found
 
 
 def replace(root: Node, where: str, node: Node | None) -> Node:

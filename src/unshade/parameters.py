@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TypeAlias
 
 import torch
 
@@ -45,7 +46,7 @@ class Layout:
     @staticmethod
     def of(root: Node) -> Layout:
         """The layout of a structure. Trees that differ only in their numbers share one."""
-        return _layout(_outline(root))
+        return layout_of(outline_of(root))
 
     def pack(self, root: Node) -> Params:
         """The numbers of a tree of this structure, (P,) float64."""
@@ -79,13 +80,16 @@ def _leaves(root: Node) -> list[Leaf]:
     return below + ([root.mask] if root.mask is not None else [])
 
 
-def _outline(root: Node, address: str = "") -> tuple[tuple[str, str, int, bool], ...]:
+Outline: TypeAlias = tuple[tuple[str, str, int, bool], ...]
+
+
+def outline_of(root: Node, address: str = "") -> Outline:
     """(address, kind, lobes, amplitude is free) of every leaf in order: all that a layout depends on."""
     address = address or root.kind
     if isinstance(root, Leaf):
         return ((address, root.kind, root.lobes, True),)
     carried = carried_amplitude(root)
-    found = [entry for index, child in enumerate(root.children) for entry in _outline(child, f"{address}.{index}.{child.kind}")]
+    found = [entry for index, child in enumerate(root.children) for entry in outline_of(child, f"{address}.{index}.{child.kind}")]
     if carried is not None:
         found = [(where, kind, lobes, kind != carried.kind) for where, kind, lobes, _ in found]
     if root.mask is not None:
@@ -94,7 +98,8 @@ def _outline(root: Node, address: str = "") -> tuple[tuple[str, str, int, bool],
 
 
 @lru_cache(maxsize=512)
-def _layout(outline: tuple[tuple[str, str, int, bool], ...]) -> Layout:
+def layout_of(outline: Outline) -> Layout:
+    """The layout of all trees of an outline."""
     slots: list[tuple[slice, ...]] = []
     names: list[str] = []
     types: list[str] = []

@@ -12,7 +12,8 @@ from collections.abc import Generator, Iterator
 from unshade.beam import Seen, is_released, lineages
 from unshade.changes import paints_as_shades, removals, swaps
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
-from unshade.fit.model import NO_LIMITS, Limits, Model, soften, softness_of
+from unshade.fit.model import Model, soften
+from unshade.fit.plan import NO_LIMITS, Limits, softness_of
 from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
 from unshade.moves import Proposer
 from unshade.nodes import Leaf, Node, count_values, walk

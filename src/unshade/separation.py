@@ -20,8 +20,9 @@ import torch
 import torch.nn.functional as F
 
 from unshade.atoms import dictionary_of, directions
-from unshade.fit.model import Limits, Model
+from unshade.fit.model import Model
 from unshade.fit.pixels import Pixels
+from unshade.fit.plan import Limits
 from unshade.moves import add_light
 from unshade.nodes import Leaf, Node, Operator, count_values, find, replace, walk
 from unshade.sphere import SCORED_RADIUS, disc_mask, sphere_normals

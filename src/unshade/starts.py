@@ -9,8 +9,9 @@ import torch
 
 from unshade.atoms import Dictionary, dictionary_of
 from unshade.fit.least_squares import COARSE_SIZE, COARSE_SOFTNESS, fit_pixels
-from unshade.fit.model import Model, is_locked, soften
+from unshade.fit.model import Model, soften
 from unshade.fit.pixels import Pixels
+from unshade.fit.plan import is_locked
 from unshade.nodes import KINDS, Leaf, Node, Operator, Raster, find, replace, tint, walk
 from unshade.types import Image, Mask
 

@@ -17,7 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from unshade import baselines, learned, second_stage
+from unshade import baselines, learned, pruning, second_stage
 from unshade.decompose import Decomposition, decompose, fit
 from unshade.errors import MissingWeightsError, UnshadeError, did_you_mean
 from unshade.inference import Inference
@@ -116,7 +116,7 @@ def _settings(method: str) -> tuple[Any, ...]:
     networks = {"learned": VARIANTS.get(name.argument or "full"), "hybrid": learned.PROPOSED}.get(name.kind)
     fixed: tuple[Any, ...] = ()
     if name.kind == "learned":
-        fixed = (learned.PLACED_STEPS, learned.WHOLE_STEPS, learned.SURVIVORS, learned.REMOVED, second_stage.NODE_EFFORT)
+        fixed = (learned.PLACED_STEPS, learned.WHOLE_STEPS, learned.SURVIVORS, pruning.REMOVED, second_stage.NODE_EFFORT)
     return preset, networks, fixed
 
 

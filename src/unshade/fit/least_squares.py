@@ -12,8 +12,9 @@ from collections.abc import Collection
 import torch
 
 from unshade.fit.fitted import Fitted
-from unshade.fit.model import EDGE, NO_LIMITS, Limits, Model, is_hard, is_locked, soften, softness_of
+from unshade.fit.model import Model, soften
 from unshade.fit.pixels import Pixels
+from unshade.fit.plan import EDGE, NO_LIMITS, Limits, is_hard, is_locked, softness_of
 from unshade.nodes import KINDS, Leaf, Node, replace, walk
 from unshade.types import Image, Mask
 
