@@ -17,8 +17,9 @@ from unshade.fit.model import Model
 from unshade.fit.pixels import Pixels
 from unshade.grammar import validate
 from unshade.growth import Candidate, Effort, Front, Samples
+from unshade.limits import MAX_NODES
 from unshade.moves import Anatomy, Move, Proposer, add_light, add_shade, complement, is_paint, recolored
-from unshade.nodes import MAX_NODES, Leaf, Node, count_values, find, leaf, mix, multiply, screen, walk
+from unshade.nodes import Leaf, Node, count_values, find, leaf, mix, multiply, screen, walk
 from unshade.render import render
 from unshade.search_reflecting import ReflectingSearch
 from unshade.sphere import sphere_normals

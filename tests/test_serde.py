@@ -23,7 +23,8 @@ from PIL import Image as PILImage
 import unshade.files
 from strategies import families, rasters, trees
 from unshade.errors import OutputError, TreeError, TreeSyntaxError
-from unshade.nodes import KINDS, MAX_DEPTH, MAX_NODES, Kind, Leaf, Operator, Parameter, Raster, Role, Tree, leaf, multiply, register, screen
+from unshade.limits import MAX_DEPTH, MAX_NODES
+from unshade.nodes import KINDS, Kind, Leaf, Operator, Parameter, Raster, Role, Tree, leaf, multiply, register, screen
 from unshade.png import PngError, read_png, write_png
 from unshade.rasters import raster_from_png, raster_to_png
 from unshade.schema import tree_schema

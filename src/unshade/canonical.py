@@ -22,7 +22,8 @@ from typing import TypeAlias, cast
 import numpy as np
 
 from unshade.errors import TreeError
-from unshade.nodes import KINDS, MAX_NODES, Leaf, Node, Operator, Raster, Role, Tree, Value, depth_limit
+from unshade.limits import MAX_NODES, depth_limit
+from unshade.nodes import KINDS, Leaf, Node, Operator, Raster, Role, Tree, Value
 from unshade.shading import SHARPEST_EDGE
 
 Color: TypeAlias = "tuple[float, float, float]"

@@ -11,7 +11,8 @@ from typing import TypeAlias
 
 from unshade.canonical import canonical, same_structure, structure_key
 from unshade.errors import TreeError
-from unshade.nodes import MAX_NODES, Node, Operator, Tree, depth_limit, walk
+from unshade.limits import MAX_NODES, depth_limit
+from unshade.nodes import Node, Operator, Tree, walk
 from unshade.sampler import RELEASED, all_canonical_structures, sample
 
 __all__ = [

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,12 +22,6 @@ import torch
 from unshade import shading
 from unshade.blend import BLENDS
 from unshade.errors import AddressError, TreeError, did_you_mean
-
-MAX_DEPTH = 200
-"""Deepest nesting a tree may have. Recursion stays well inside Python's own limit."""
-
-MAX_NODES = 20_000
-"""Most nodes a tree may have."""
 
 
 class Role(enum.Enum):
@@ -649,9 +642,3 @@ def count_values(root: Node) -> int:
         else:
             total -= carried_amplitude(node) is not None
     return total
-
-
-@lru_cache(maxsize=1)
-def depth_limit() -> int:
-    """The nesting a recursive pass may use: `MAX_DEPTH`, or less where Python's own limit is low."""
-    return min(MAX_DEPTH, sys.getrecursionlimit() // 4)

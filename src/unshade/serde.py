@@ -27,23 +27,8 @@ from unshade.blend import BLENDS
 from unshade.errors import TreeError, TreeSyntaxError, did_you_mean
 from unshade.files import write_whole
 from unshade.grammar import check_size
-from unshade.nodes import (
-    KINDS,
-    MAX_NODES,
-    Family,
-    Kind,
-    Leaf,
-    Member,
-    Node,
-    Operator,
-    Parameter,
-    Raster,
-    Role,
-    Tree,
-    Value,
-    depth_limit,
-    is_kind,
-)
+from unshade.limits import MAX_NODES, depth_limit
+from unshade.nodes import KINDS, Family, Kind, Leaf, Member, Node, Operator, Parameter, Raster, Role, Tree, Value, is_kind
 from unshade.rasters import raster_from_base64, raster_to_base64
 from unshade.text import number_text, parse, to_text
 
