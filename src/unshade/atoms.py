@@ -38,7 +38,9 @@ class Atoms:
     """(M,) bool, true where the leaf has an amplitude of its own."""
 
     def project(self, basis: torch.Tensor, residual: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """For every leaf, ``basis`` times its picture against the residual and against itself, (3, M) each.
+        """For every leaf, ``basis`` (*, 3, N) times its picture against the residual and against itself, (*, 3, M) each.
+
+        One product for the bases of several places reads the pictures once.
 
         Their ratio is the colour of the leaf that lowers the squared error most, where it is added as ``basis * color * picture``.
         """

@@ -160,13 +160,11 @@ class Proposer:
             if environment:
                 found += self._lobes(root, known[environment], residual, family)
             elif family.endswith(("lights", "rims", "spots", "environments")):
-                found += self._lights(root, known[parts.canvas], residual, family, grey_only=family in GREY)
-                if family in ("lights", "spots"):
-                    for where in parts.forms[:1]:
-                        found += self._lights(root, known[where], residual, family, grey_only=True)
+                forms = parts.forms[:1] if family in ("lights", "spots") else ()
+                found += self._lights(root, [known[where] for where in (parts.canvas, *forms)], residual, family)
             elif family in ("masks", "plain_masks"):
-                for where in dict.fromkeys(((root.kind,) if family == "masks" and parts.edges < 2 else ()) + parts.paints):
-                    found += self._paints(root, known[where], residual, family)
+                whole = (root.kind,) if family == "masks" and parts.edges < 2 else ()
+                found += self._paints(root, [known[where] for where in dict.fromkeys(whole + parts.paints)], residual, family)
             else:
                 found += self._shades(root, known[parts.base], residual, family)
         found.sort(key=lambda move: -move.relative)
@@ -182,27 +180,29 @@ class Proposer:
     def _best(self, atoms: Atoms, score: torch.Tensor, how_many: int) -> list[int]:
         return torch.topk(score, min(how_many, len(atoms.leaves))).indices.tolist()
 
-    def _lights(self, root: Node, place: _Place, residual: torch.Tensor, family: str, grey_only: bool) -> list[Move]:
+    def _lights(self, root: Node, places: list[_Place], residual: torch.Tensor, family: str) -> list[Move]:
+        """Lights on the canvas, the first of the places, and grey ones on the others."""
         atoms = self.dictionary[family]
-        basis = place.gain * (1.0 - place.value)
-        up, down = atoms.project(basis, residual, self.weight)
+        basis = torch.stack([place.gain * (1.0 - place.value) for place in places])
         moves = []
-        color = (up / down.clamp(min=1e-12)).clamp(0.0, 1.0)
-        saved = (2.0 * color * up - color.square() * down).sum(0) / 3.0
-        grey = torch.where(atoms.scalable, (up.sum(0) / down.sum(0).clamp(min=1e-12)).clamp(0.0, 1.0), torch.ones(()))
-        saved_grey = (2.0 * grey * up.sum(0) - grey.square() * down.sum(0)) / 3.0
-        if not grey_only:
-            for k in self._best(atoms, saved, 2):
-                shade = tuple(color[:, k].tolist())
-                entry = atoms.leaves[k]
-                light = entry.set(color=shade) if entry.kind == "environment" else multiply(leaf("albedo", color=shade), entry)
-                moves.append(self._move(root, place, add_light(place.node, light), f"tinted {family}", float(saved[k])))
-        if not family.endswith("environments"):
-            for k in self._best(atoms, saved_grey, 2):
-                entry = atoms.leaves[k]
-                amplitude = KINDS[entry.kind].amplitude
-                light = entry.set(**{amplitude: float(grey[k])}) if amplitude else entry
-                moves.append(self._move(root, place, add_light(place.node, light), f"grey {family}", float(saved_grey[k])))
+        for number, (place, up, down) in enumerate(zip(places, *atoms.project(basis, residual, self.weight), strict=True)):
+            if number == 0 and family not in GREY:
+                color = (up / down.clamp(min=1e-12)).clamp(0.0, 1.0)
+                saved = (2.0 * color * up - color.square() * down).sum(0) / 3.0
+                for k in self._best(atoms, saved, 2):
+                    shade = tuple(color[:, k].tolist())
+                    entry = atoms.leaves[k]
+                    light = entry.set(color=shade) if entry.kind == "environment" else multiply(leaf("albedo", color=shade), entry)
+                    moves.append(self._move(root, place, add_light(place.node, light), f"tinted {family}", float(saved[k])))
+            if not family.endswith("environments"):
+                up, down = up.sum(0), down.sum(0)
+                grey = torch.where(atoms.scalable, (up / down.clamp(min=1e-12)).clamp(0.0, 1.0), torch.ones(()))
+                saved = (2.0 * grey * up - grey.square() * down) / 3.0
+                for k in self._best(atoms, saved, 2):
+                    entry = atoms.leaves[k]
+                    amplitude = KINDS[entry.kind].amplitude
+                    light = entry.set(**{amplitude: float(grey[k])}) if amplitude else entry
+                    moves.append(self._move(root, place, add_light(place.node, light), f"grey {family}", float(saved[k])))
         return moves
 
     def _lobes(self, root: Node, place: _Place, residual: torch.Tensor, family: str) -> list[Move]:
@@ -219,22 +219,25 @@ class Proposer:
             moves.append(self._move(root, place, dataclasses.replace(place.node, values=joined), family, float(saved[k])))
         return moves
 
-    def _paints(self, root: Node, place: _Place, residual: torch.Tensor, family: str) -> list[Move]:
+    def _paints(self, root: Node, places: list[_Place], residual: torch.Tensor, family: str) -> list[Move]:
+        """Another colour where a mask is 1."""
         atoms = self.dictionary[family]
         # the picture changes by A m (c - X): least squares in c of (residual + A m X) - A m c
-        gain, value = place.gain, place.value
-        straight = torch.cat([self.weight * gain * residual, self.weight * gain * residual * value]) @ atoms.pictures.T
-        square = self.weight * gain.square()
-        squared = torch.cat([square, square * value, square * value.square()]) @ atoms.squares.T
-        squares_gain = squared[:3]
-        cross = straight[:3] + squared[3:6]
-        color = (cross / squares_gain.clamp(min=1e-12)).clamp(0.0, 1.0)
-        constant = 2.0 * straight[3:] + squared[6:]
-        saved = (2.0 * color * cross - color.square() * squares_gain - constant).sum(0) / 3.0
+        gain = torch.stack([place.gain for place in places])
+        value = torch.stack([place.value for place in places])
+        pulled, square = self.weight * gain * residual, self.weight * gain.square()
+        straight = torch.cat([pulled, pulled * value], 1) @ atoms.pictures.T
+        squared = torch.cat([square, square * value, square * value.square()], 1) @ atoms.squares.T
+        squares_gain = squared[:, :3]
+        cross = straight[:, :3] + squared[:, 3:6]
+        colors = (cross / squares_gain.clamp(min=1e-12)).clamp(0.0, 1.0)
+        constant = 2.0 * straight[:, 3:] + squared[:, 6:]
+        saved_at = (2.0 * colors * cross - colors.square() * squares_gain - constant).sum(1) / 3.0
         moves = []
-        for k in self._best(atoms, saved, 3):
-            paint = leaf("albedo", color=tuple(color[:, k].tolist()))
-            moves.append(self._move(root, place, mix(paint, place.node, atoms.leaves[k]), family, float(saved[k])))
+        for place, color, saved in zip(places, colors, saved_at, strict=True):
+            for k in self._best(atoms, saved, 3):
+                paint = leaf("albedo", color=tuple(color[:, k].tolist()))
+                moves.append(self._move(root, place, mix(paint, place.node, atoms.leaves[k]), family, float(saved[k])))
         return moves
 
     def _shades(self, root: Node, place: _Place, residual: torch.Tensor, family: str) -> list[Move]:
