@@ -129,6 +129,12 @@ def test_a_shade_brings_what_it_promises(start: str, family: str) -> None:
     assert kept > 0
 
 
+def test_a_tree_without_paint_is_given_none_where_none_can_be() -> None:
+    assert proposed(FORM, ("plain_masks",))[1] == []
+    moves = proposed(mix(B, mix(C, FORM, BAND), HALF), ("masks", "lights"))[1]
+    assert moves and not any(move.family == "masks" for move in moves), "two drawn edges lie over the whole already"
+
+
 def test_the_missing_leaf_is_proposed_first() -> None:
     true = screen(multiply(A, FORM), leaf("highlight", direction=(0.3, 0.5, 0.8), sharpness=35.0, amplitude=0.6))
     pixels = small_pixels(true)

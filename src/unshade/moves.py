@@ -221,6 +221,8 @@ class Proposer:
 
     def _paints(self, root: Node, places: list[_Place], residual: torch.Tensor, family: str) -> list[Move]:
         """Another colour where a mask is 1."""
+        if not places:
+            return []
         atoms = self.dictionary[family]
         # the picture changes by A m (c - X): least squares in c of (residual + A m X) - A m c
         gain = torch.stack([place.gain for place in places])
