@@ -289,8 +289,7 @@ def _learned(
     from unshade import learned
     from unshade.inference import Networks
 
-    proposed = learned.PROPOSED if method == "hybrid" else learned.Settings(second_stage=second_stage, objective=objective)
-    given = settings or dataclasses.replace(proposed, device=device)
+    given = settings or learned.Settings(second_stage=second_stage, objective=objective, device=device)
     try:
         torch.empty(1, device=given.device)
     except (RuntimeError, AssertionError) as error:

@@ -72,10 +72,6 @@ class Settings:
     """Of the networks, on a CPU; 0 for as many as PyTorch uses when the work begins."""
 
 
-PROPOSED = Settings(Inference(samples=12, draws=64, trees=4, remainders=False, hidden=0.0, seen_first=False))
-"""Of the hybrid: several trees side by side, which the search finishes. Whether it gains by remainders was not measured."""
-
-
 @dataclass
 class Stages:
     """What each stage did and took. All but the seconds depend on the picture, the settings and the seed alone."""

@@ -113,7 +113,7 @@ def _settings(method: str) -> tuple[Any, ...]:
     """What a method's numbers are set to, where it has such."""
     name = name_of(method)
     preset = PRESETS[name.argument] if name.argument in PRESETS else PRESETS["balanced"] if name.kind in ("search", *NETWORKS) else None
-    networks = {"learned": VARIANTS.get(name.argument or "full"), "hybrid": learned.PROPOSED}.get(name.kind)
+    networks = {"learned": VARIANTS.get(name.argument or "full"), "hybrid": Settings()}.get(name.kind)
     fixed: tuple[Any, ...] = ()
     if name.kind == "learned":
         fixed = (learned.PLACED_STEPS, learned.WHOLE_STEPS, learned.SURVIVORS, pruning.REMOVED, second_stage.NODE_EFFORT)
