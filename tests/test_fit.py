@@ -13,7 +13,7 @@ from unshade.errors import AddressError
 from unshade.fit.least_squares import error_of, fit_least_squares, fit_pixels, place_edges, sharpen
 from unshade.fit.model import Model, soften
 from unshade.fit.pixels import Pixels
-from unshade.fit.plan import is_hard
+from unshade.fit.plan import Plan, is_hard
 from unshade.grammar import same_structure
 from unshade.metrics import psnr
 from unshade.nodes import KINDS, Kind, Leaf, Node, Parameter, Raster, Role, Tree, find, leaf, mix, multiply, register, replace, screen, walk
@@ -150,6 +150,38 @@ def test_a_kind_from_outside_is_differentiated_and_fitted(wave: Kind) -> None:
     fitted = fit_pixels(pixels_of(true), start, tolerance=1e-8)
     assert fitted.error < 1e-8
     assert find(fitted.root, "multiply.1")["pitch"][0] == pytest.approx(4.0, rel=1e-2)
+
+
+def test_kinds_with_nothing_to_set_and_with_a_picture_a_lobe_are_fitted_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    glass = Kind("glass_for_tests", Role.ENVIRONMENT, lambda normals: 0.3 * normals[..., 2:3, :, :].clamp(min=0.0), (), "nothing to set")
+    pixels = Parameter("pixels", "raster", "what is seen")
+    strength = Parameter("strength", "scalar", "how bright", 0.0, 1.0, (0.5,))
+
+    def shown(normals: torch.Tensor, strength: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+        return (pixels.mean((-1, -2), keepdim=True) * strength.sum(-2)[..., None, None] * torch.ones_like(normals[..., 2:3, :, :])).clamp(
+            max=1.0
+        )
+
+    slides = Kind("slides_for_tests", Role.ENVIRONMENT, shown, (strength, pixels), "strengths of a picture", channels=3, repeats=True)
+    for kind in (glass, slides):
+        monkeypatch.setitem(KINDS, kind.name, kind)
+    window, seen = leaf("glass_for_tests"), leaf("slides_for_tests", pixels=RASTER, strength=(0.2, 0.3))
+    for root in (multiply(A, FORM), multiply(leaf("albedo", color=(0.2, 0.6, 0.4)), FORM)):
+        true = screen(root, window, window, seen)
+        start = replace(true, "screen.0.multiply.0.albedo", leaf("albedo", color=(0.5, 0.5, 0.5)))
+        assert fit_pixels(pixels_of(true), start).error < 1e-9
+    assert fit_pixels(pixels_of(multiply(A, FORM)), window).root == window
+
+
+def test_trees_that_differ_in_numbers_alone_share_a_plan() -> None:
+    def plan(edge: float, color: float = 0.5, locked: tuple[str, ...] = (), limits: tuple[float, float] = (0.0, 1.0)) -> Plan:
+        mask = leaf("threshold", direction=(0, 0.5, 1), threshold=0.1, softness=edge)
+        return Plan.of(mix(leaf("albedo", color=(color, 0.1, 0.2)), B, mask), locked, {"color": limits})
+
+    assert plan(0.1) is plan(0.2, color=0.7)
+    assert plan(0.0).free == plan(0.1).free - 4, "a hard edge stays where it is"
+    assert plan(0.1, locked=("mix.1",)).free == plan(0.1).free - 3
+    assert plan(0.1, limits=(0.2, 0.8)).low.max() == 0.2
 
 
 def test_locked_and_limited_numbers_stay() -> None:

@@ -17,12 +17,12 @@ from unshade.fit.model import Model
 from unshade.fit.pixels import Pixels
 from unshade.grammar import validate
 from unshade.growth import Candidate, Effort, Front, Samples
-from unshade.limits import MAX_NODES
 from unshade.moves import Anatomy, Move, Proposer, add_light, add_shade, complement, is_paint, recolored
 from unshade.nodes import Leaf, Node, count_values, find, leaf, mix, multiply, screen, walk
 from unshade.render import render
 from unshade.search_reflecting import ReflectingSearch
 from unshade.sphere import sphere_normals
+from unshade.tree_size import MAX_NODES
 
 A, B, C = (leaf("albedo", color=color) for color in ((0.5, 0.3, 0.2), (0.15, 0.25, 0.5), (0.3, 0.6, 0.3)))
 WHITE, BLACK = leaf("albedo", color=(1.0, 1.0, 1.0)), leaf("albedo", color=(0.0, 0.0, 0.0))

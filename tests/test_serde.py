@@ -23,13 +23,13 @@ from PIL import Image as PILImage
 import unshade.files
 from strategies import families, rasters, trees
 from unshade.errors import OutputError, TreeError, TreeSyntaxError
-from unshade.limits import MAX_DEPTH, MAX_NODES
 from unshade.nodes import KINDS, Kind, Leaf, Operator, Parameter, Raster, Role, Tree, leaf, multiply, register, screen
 from unshade.png import PngError, read_png, write_png
 from unshade.rasters import raster_from_png, raster_to_png
 from unshade.schema import tree_schema
 from unshade.serde import dump, dumps, load, load_family, loads, loads_family
 from unshade.text import COLOR_WORDS, parse, to_text
+from unshade.tree_size import MAX_DEPTH, MAX_NODES
 
 SCHEMA_FILE = Path(sys.modules["unshade.serde"].__file__ or "").with_name("tree.schema.json")
 EXAMPLE = "screen(multiply(albedo(#cc2030), diffuse(left up, ambient=0.2)), highlight((0.1, 0.2, 0.97), sharpness=40, amplitude=1))"

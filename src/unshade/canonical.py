@@ -22,9 +22,9 @@ from typing import TypeAlias, cast
 import numpy as np
 
 from unshade.errors import TreeError
-from unshade.limits import MAX_NODES, depth_limit
 from unshade.nodes import KINDS, Leaf, Node, Operator, Raster, Role, Tree, Value
 from unshade.shading import SHARPEST_EDGE
+from unshade.tree_size import MAX_NODES, depth_limit
 
 Color: TypeAlias = "tuple[float, float, float]"
 

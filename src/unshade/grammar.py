@@ -11,9 +11,9 @@ from typing import TypeAlias
 
 from unshade.canonical import canonical, same_structure, structure_key
 from unshade.errors import TreeError
-from unshade.limits import MAX_NODES, depth_limit
 from unshade.nodes import Node, Operator, Tree, walk
 from unshade.sampler import RELEASED, all_canonical_structures, sample
+from unshade.tree_size import MAX_NODES, depth_limit
 
 __all__ = [
     "PAPER",

@@ -54,7 +54,7 @@ def losses(root: Node, pixels: Pixels) -> list[tuple[float, str, Node | None]]:
 def _instead(
     root: Node, where: str, kept: Node | None, nodes: dict[str, tuple[torch.Tensor, torch.Tensor | float]], pixels: Pixels
 ) -> torch.Tensor | float:
-    """The picture of what stands at an address then."""
+    """The picture of what stands at an address once something is lost."""
     if kept is None:
         identity = BLENDS[where.rsplit(".", 2)[0].rpartition(".")[2]].identity
         assert identity is not None

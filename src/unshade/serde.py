@@ -27,10 +27,10 @@ from unshade.blend import BLENDS
 from unshade.errors import TreeError, TreeSyntaxError, did_you_mean
 from unshade.files import write_whole
 from unshade.grammar import check_size
-from unshade.limits import MAX_NODES, depth_limit
 from unshade.nodes import KINDS, Family, Kind, Leaf, Member, Node, Operator, Parameter, Raster, Role, Tree, Value, is_kind
 from unshade.rasters import raster_from_base64, raster_to_base64
 from unshade.text import number_text, parse, to_text
+from unshade.tree_size import MAX_NODES, depth_limit
 
 __all__ = ["VERSION", "dump", "dumps", "load", "load_family", "loads", "loads_family", "parse", "to_text"]
 

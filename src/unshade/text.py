@@ -22,9 +22,9 @@ from typing import Literal, NoReturn, cast
 from unshade.blend import BLENDS
 from unshade.errors import TreeError, TreeSyntaxError, did_you_mean
 from unshade.grammar import check_size
-from unshade.limits import MAX_NODES, depth_limit
 from unshade.nodes import KINDS, Kind, Leaf, Node, Operator, Parameter, Raster, Role, Tree, Value, is_kind
 from unshade.rasters import raster_from_base64, raster_to_base64
+from unshade.tree_size import MAX_NODES, depth_limit
 
 DIRECTION_WORDS = {
     "right": (1.0, 0.0, 0.0),

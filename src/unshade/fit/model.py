@@ -34,6 +34,9 @@ def soften(root: Node, softness: float, locked: Collection[str] = ()) -> Node:
 class Model:
     """A structure at given pixels: values, gains and Jacobian.
 
+    What was computed last is kept: a vector or a list of values that was given once is not to be changed, and nothing is differentiated
+    by PyTorch.
+
     Args:
         root: the structure. pixels: where. locked: addresses of leaves, subtrees or ``address.parameter`` that are kept.
         softest: least softness of an edge. limits: narrower ranges by ``parameter`` or ``kind.parameter``.
@@ -46,8 +49,8 @@ class Model:
         self.layout, self.free, self.number = self.plan.layout, self.plan.free, self.plan.number
         self.normals = pixels.normals[:, None, :]
         self.grazing = (1.0 - pixels.normals[2]).clamp(1e-6, 1.0)
-        self.tree = [node for _, node in walk(root)]
-        self.leaves = [node for node in self.tree if isinstance(node, Leaf)]
+        self.every_node = [node for _, node in walk(root)]
+        self.leaves = [node for node in self.every_node if isinstance(node, Leaf)]
         self._last_arguments: tuple[torch.Tensor, list[list[torch.Tensor]]] | None = None
         self._last_pictures: tuple[list[torch.Tensor], list[torch.Tensor]] | None = None
         self._last_tangents: tuple[torch.Tensor, torch.Tensor] | None = None
@@ -62,10 +65,11 @@ class Model:
             parts = vector.to(self.normals.dtype).index_select(0, plan.order).split(plan.widths)
             found = iter([part.view(shape) for part, shape in zip(parts, plan.shapes, strict=True)])
             arguments = [
-                [stored.tensor(vector.device, self.normals.dtype)[None] if isinstance(stored, Raster) else own for stored, own in pairs]
+                [
+                    stored.tensor(vector.device, self.normals.dtype)[None] if isinstance(stored, Raster) else next(found)
+                    for stored in self.leaves[group.leaves[0]].values
+                ]
                 for group in plan.groups
-                # All of a group have as many parameters.
-                if (pairs := [(stored, next(found)) for stored in self.leaves[group.leaves[0]].values])
             ]
             self._last_arguments = vector, arguments
         return self._last_arguments[1]
@@ -78,7 +82,8 @@ class Model:
                 found = arguments[0][..., None]
             else:
                 found = KINDS[group.kind].formula(self.normals, *arguments)[..., 0, :]
-            for k, value in zip(group.leaves, found.unbind(0), strict=True):
+            # A kind without parameters has one picture, however many leaves are of it.
+            for k, value in zip(group.leaves, found.expand(len(group.leaves), *found.shape[-2:]).unbind(0), strict=True):
                 values[k] = value
         return values
 
@@ -92,27 +97,27 @@ class Model:
         A fit asks twice for the same values, for the picture and for the gains.
         """
         if self._last_pictures is None or self._last_pictures[0] is not values:
-            pictures: list[torch.Tensor] = [values[0]] * len(self.tree)
+            pictures: list[torch.Tensor] = [values[0]] * len(self.every_node)
             for place, value in zip(self.plan.leaf_places, values, strict=True):
                 pictures[place] = value
-            for place, step in reversed(self.plan.operators):
-                pictures[place] = BLENDS[step.kind].apply(*(pictures[below] for below in step.below))
+            for join in reversed(self.plan.joins):
+                pictures[join.place] = BLENDS[join.kind].apply(*(pictures[below] for below in join.below))
             self._last_pictures = values, pictures
         return self._last_pictures[1]
 
     def _gains(self, pictures: list[torch.Tensor]) -> list[torch.Tensor | float]:
         """d output / d node of every node, in the same order."""
         gains: list[torch.Tensor | float] = [1.0] * len(pictures)
-        for place, step in self.plan.operators:
-            own = BLENDS[step.kind].gains(*(pictures[below] for below in step.below))
-            for below, gain in zip(step.below, own, strict=True):
-                gains[below] = gains[place] * gain if place else gain
+        for join in self.plan.joins:
+            own = BLENDS[join.kind].gains(*(pictures[below] for below in join.below))
+            for below, gain in zip(join.below, own, strict=True):
+                gains[below] = gains[join.place] * gain if join.place else gain
         return gains
 
     def nodes(self, values: list[torch.Tensor]) -> Iterator[tuple[str, Node, torch.Tensor, torch.Tensor | float]]:
         """(address, node, value, gain) of every node, masks included; the gain is d output / d node."""
         pictures = self._pictures(values)
-        yield from zip(self.plan.addresses, self.tree, pictures, self._gains(pictures), strict=True)
+        yield from zip(self.plan.addresses, self.every_node, pictures, self._gains(pictures), strict=True)
 
     def jacobian(self, vector: torch.Tensor, values: list[torch.Tensor], weight: torch.Tensor | float = 1.0) -> torch.Tensor:
         """d picture / d free coordinates times the ``weight`` of each pixel, (F, 3, N)."""

@@ -1,6 +1,7 @@
 """What a second-order fit has to know of a structure besides its numbers: how its pictures are joined, and what may move.
 
-A search fits thousands of trees that differ in their numbers alone; they share one plan.
+Trees that differ in their numbers alone share one plan, as long as the same of their edges are hard. A search looks at most structures
+more than once.
 """
 
 from __future__ import annotations
@@ -39,12 +40,13 @@ def is_locked(address: str, parameter: str, locked: Collection[str]) -> bool:
 
 
 @dataclass(frozen=True)
-class Step:
-    """A node, in the order of `nodes.walk`."""
+class Join:
+    """An operator. Places are those of `nodes.walk`."""
 
+    place: int
     kind: str
     below: tuple[int, ...]
-    """The places of its children, and of its mask after them; none for a leaf."""
+    """Its children, and its mask after them."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +72,8 @@ class Plan:
     """One a node."""
     leaf_places: tuple[int, ...]
     """The nodes that are leaves."""
-    operators: tuple[tuple[int, Step], ...]
-    """The others, with their places, parents first."""
+    joins: tuple[Join, ...]
+    """The others, parents first."""
     groups: tuple[Group, ...]
     free: int
     """F."""
@@ -114,8 +116,8 @@ def _shape(root: Node) -> Shape:
     )
 
 
-def _steps(shape: Shape) -> tuple[Step, ...]:
-    """The nodes with their places: one that has not all of its children takes the next node."""
+def _joins(shape: Shape) -> tuple[Join, ...]:
+    """The operators: one that has not all of its children takes the next node."""
     below: list[list[int]] = [[] for _ in shape]
     open_: list[int] = []
     for place, (_, _, count) in enumerate(shape):
@@ -125,10 +127,10 @@ def _steps(shape: Shape) -> tuple[Step, ...]:
                 open_.pop()
         if count:
             open_.append(place)
-    return tuple(Step(kind, tuple(places)) for (_, kind, _), places in zip(shape, below, strict=True))
+    return tuple(Join(place, kind, tuple(below[place])) for place, (_, kind, count) in enumerate(shape) if count)
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=256)
 def _plan(
     outline: Outline,
     shape: Shape,
@@ -150,7 +152,7 @@ def _plan(
         directions = number[torch.tensor([tangent == 0 for _, tangent in flat], dtype=torch.bool)]
         return Plan(
             layout=layout,
-            operators=tuple((place, step) for place, step in enumerate(_steps(shape)) if step.below),
+            joins=_joins(shape),
             addresses=tuple(address for address, _, _ in shape),
             leaf_places=tuple(place for place, (_, _, count) in enumerate(shape) if not count),
             groups=groups,
@@ -202,16 +204,16 @@ def _pattern(k: int, address: str, name: str, layout: Layout, hard: bool, locked
 
 
 def _order(groups: tuple[Group, ...]) -> tuple[torch.Tensor, tuple[int, ...], tuple[tuple[int, ...], ...]]:
-    """See `Plan.order`: (K, n) numbers of a parameter, (1, lobes, n) of a kind that repeats."""
+    """See `Plan.order`: (K, n) numbers of a parameter, (1, lobes, n) of a kind that repeats; a raster has none."""
     every = [
-        (KINDS[group.kind], parameter, index)
+        (KINDS[group.kind].repeats, parameter.size, index)
         for group in groups
         for parameter, index in zip(KINDS[group.kind].parameters, group.index, strict=True)
+        if parameter.type != "raster"
     ]
-    shapes = tuple(
-        (1, index.numel() // parameter.size, parameter.size) if kind.repeats else tuple(index.shape) for kind, parameter, index in every
-    )
-    return torch.cat([index.flatten() for _, _, index in every]), tuple(index.numel() for _, _, index in every), shapes
+    numbers = [number for _, _, index in every for number in index.flatten().tolist()]
+    shapes = tuple((1, index.numel() // size, size) if repeats else tuple(index.shape) for repeats, size, index in every)
+    return torch.tensor(numbers, dtype=torch.long), tuple(index.numel() for _, _, index in every), shapes
 
 
 def _bounds(groups: tuple[Group, ...], limits: Limits) -> tuple[torch.Tensor, torch.Tensor]:

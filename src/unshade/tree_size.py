@@ -1,4 +1,4 @@
-"""How large a tree may be: what is read is checked against this before any pass that recurses."""
+"""How large a tree may be: checked before any pass that recurses."""
 
 from __future__ import annotations
 
