@@ -114,9 +114,8 @@ def _settings(method: str) -> tuple[Any, ...]:
     name = name_of(method)
     preset = PRESETS[name.argument] if name.argument in PRESETS else PRESETS["balanced"] if name.kind in ("search", *NETWORKS) else None
     networks = {"learned": VARIANTS.get(name.argument or "full"), "hybrid": Settings()}.get(name.kind)
-    fixed: tuple[Any, ...] = (learned.SURVIVORS, pruning.REMOVED) if name.kind == "hybrid" else ()
-    if name.kind == "learned":
-        fixed = (learned.PLACED_STEPS, learned.WHOLE_STEPS, learned.SURVIVORS, pruning.REMOVED, second_stage.NODE_EFFORT)
+    finish = (learned.SURVIVORS, pruning.REMOVED)
+    fixed = {"learned": (learned.PLACED_STEPS, learned.WHOLE_STEPS, *finish, second_stage.NODE_EFFORT), "hybrid": finish}.get(name.kind, ())
     return preset, networks, fixed
 
 
