@@ -10,10 +10,11 @@ import dataclasses
 import hashlib
 import json
 import os
+import sys
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -76,6 +77,8 @@ class Job:
     picture: Path
     folder: Path | None
     settings: Settings
+    threads: int = field(default=1, compare=False)
+    """Of the networks. They answer alike on any number; the search and the fits have one."""
 
 
 def digest(path: Path) -> str:
@@ -203,8 +206,12 @@ class Log:
             return file.read(1) == b"\n"
 
 
-def limit_threads() -> None:
+def limit_threads(method: str = "search") -> None:
     """One thread of arithmetic in this process: sums come in one order, so results do not depend on the cores or the workers."""
+    if method == "search" and "torch" not in sys.modules:
+        # PyTorch compiles a table of derivatives that is not used here, for 0.5 s, when forward-mode differentiation begins. This is
+        # read while it loads, and forbids TorchScript, by which the codes of networks are drawn.
+        os.environ["PYTORCH_JIT"] = "0"
     import torch
 
     torch.set_num_threads(1)
@@ -228,24 +235,26 @@ def decompose_picture(job: Job, on_step: Callable[[Step], None] | None = None) -
 
 
 def _decompose_picture(job: Job, on_step: Callable[[Step], None] | None) -> Record:
-    limit_threads()
+    limit_threads(job.settings.method)
     begin, settings, sphere = time.perf_counter(), job.settings, _read(job)
     from unshade.decompose import decompose
+    from unshade.threads import threads
 
-    decomposition = decompose(
-        sphere,
-        preset=settings.preset,
-        max_values=settings.max_values,
-        seed=settings.seed,
-        alternatives=settings.alternatives,
-        search=settings.search,
-        objective=settings.objective,
-        method=settings.method,
-        second_stage=settings.second_stage,
-        weights=settings.weights,
-        reflections=settings.reflections,
-        device=settings.device,
-    )
+    with threads(job.threads):
+        decomposition = decompose(
+            sphere,
+            preset=settings.preset,
+            max_values=settings.max_values,
+            seed=settings.seed,
+            alternatives=settings.alternatives,
+            search=settings.search,
+            objective=settings.objective,
+            method=settings.method,
+            second_stage=settings.second_stage,
+            weights=settings.weights,
+            reflections=settings.reflections,
+            device=settings.device,
+        )
     for step in decomposition:
         if on_step:
             on_step(step)

@@ -121,7 +121,12 @@ def cli(context: click.Context) -> None:
     help="Of the search by depth: pixels alone, or the paper's L2 plus VGG features, a hundred times slower; needs the perceptual extra.",
 )
 @network_options
-@click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes for several pictures; all cores when not given.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Processes for several pictures, threads of the networks for one; all cores when not given.",
+)
 @click.option("--resume/--force", default=True, help="Skip pictures that are done with the same settings (the default), or do them again.")
 @output_options
 def decompose(
@@ -166,10 +171,12 @@ def decompose(
     for job, record in done.items():
         _tell(record, messages, "done before  ")
         printed.add(job, record)
+    workers = workers or batch.cores()
     todo = [job for job in jobs if job not in done]
+    todo = [dataclasses.replace(job, threads=max(workers // len(todo), 1)) for job in todo]
     failures = []
     try:
-        with contextlib.closing(_decomposed(todo, workers or batch.cores(), messages)) as records:
+        with contextlib.closing(_decomposed(todo, workers, messages)) as records:
             for job, record in records:
                 log.add(job, record)
                 _tell(record, messages)
@@ -456,8 +463,6 @@ def main() -> None:
             stream.reconfigure(errors="replace")
     # Before numpy and torch load: one thread, so that no result depends on the cores.
     os.environ.update(OMP_NUM_THREADS="1", MKL_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    # PyTorch compiles a table of derivatives that is not used here, for 0.2 s, when forward-mode differentiation begins.
-    os.environ["PYTORCH_JIT"] = "0"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     code = run()
     # A late Ctrl-C would only put a traceback below what was said already.

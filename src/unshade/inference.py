@@ -34,7 +34,7 @@ import dataclasses
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Literal, cast
 
@@ -48,7 +48,11 @@ from unshade.models.prior import Priors
 from unshade.models.vqvae import VQVAE, Codes
 from unshade.remainders import completed, contrast, gains
 from unshade.synthesis import OPERATORS, TYPES
+from unshade.threads import at_once
 from unshade.types import Image, Mask
+
+OF_A_JOB = 8
+"""Masks that a thread asks g for at once."""
 
 
 @dataclass(frozen=True)
@@ -223,11 +227,11 @@ def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> I
 
     Args:
         image: (3, S, S) from `node_image`.
-        seed: of all samples. The same seed gives the same pools on the same machine and threads.
+        seed: of all samples. The same seed gives the same pools on the same machine, however many threads.
     """
     generator = torch.Generator(networks.device).manual_seed(seed)
     with torch.no_grad():
-        codes = networks.vqvae.encode(image[None].to(networks.device))
+        (codes,) = at_once([partial(networks.vqvae.encode, image[None].to(networks.device))], networks.device)
     # Its type is not asked: a picture that is one leaf has a blank child however it is split, so it is left over.
     pools: tuple[Pool, ...] = (Pool((Part(image.to(networks.device), codes, "operator", "open", 0),)),)
     drawn = 0
@@ -287,16 +291,18 @@ def _drawn(parts: Sequence[Part], networks: Networks, settings: Inference, gener
     codes = networks.priors.sample_children(vqvae, given, settings.samples, generator, settings.temperature)
     parents = torch.stack([part.image for part in parts]).repeat_interleave(settings.samples, 0)
     images = first = _decoded(vqvae, codes)
-    numbers = heads.operator(parents, *images).argmax(1)
+    judged = [partial(heads.operator, parents, *images), *(partial(heads.types, child) for child in images)]
+    numbers, *types = (logits.argmax(1) for logits in at_once(judged, parents.device))
     operators = [OPERATORS[number] for number in numbers.tolist()]
     masks = _masks(heads, parents, images, numbers == OPERATORS.index("mix"))
     known = [mask if operator == "mix" else None for operator, mask in zip(operators, masks, strict=True)]
-    left, right = ([TYPES[number] for number in heads.types(child).argmax(1).tolist()] for child in images)
+    left, right = ([TYPES[number] for number in side.tolist()] for side in types)
     kinds = list(zip(left, right, strict=True))
     if settings.remainders:
         pairs = [completed(*row) for row in zip(parents, operators, zip(*images, strict=True), known, kinds, strict=True)]
         images = torch.stack([pair[0] for pair in pairs]), torch.stack([pair[1] for pair in pairs])
-        codes = vqvae.encode(images[0]), vqvae.encode(images[1])
+        left_codes, right_codes = at_once([partial(vqvae.encode, side) for side in images], parents.device)
+        codes = left_codes, right_codes
         through, same = _decoded(vqvae, codes), parents
     else:
         through, same = images, vqvae.decode(given).repeat_interleave(settings.samples, 0)
@@ -309,12 +315,14 @@ def _masks(heads: Heads, parents: Image, images: tuple[Image, Image], asked: tor
     """(B, 1, S, S), 0 where it is not asked for: three quarters of the time of all three heads is g's."""
     masks = torch.zeros_like(parents[:, :1])
     if asked.any():
-        masks[asked] = torch.sigmoid(heads.mask(parents[asked], *(side[asked] for side in images)))
+        rows = zip(*(side[asked].split(OF_A_JOB) for side in (parents, *images)), strict=True)
+        masks[asked] = torch.sigmoid(torch.cat(at_once([partial(heads.mask, *row) for row in rows], parents.device)))
     return masks
 
 
 def _decoded(vqvae: VQVAE, codes: tuple[Codes, Codes]) -> tuple[Image, Image]:
-    return vqvae.decode(codes[0]), vqvae.decode(codes[1])
+    left, right = at_once([partial(vqvae.decode, side) for side in codes], codes[0].top.device)
+    return left, right
 
 
 def _splits(parts: Sequence[Part], networks: Networks, settings: Inference, generator: torch.Generator) -> list[list[_Split]]:

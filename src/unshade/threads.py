@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import TypeVar
 
 import torch
+
+Answer = TypeVar("Answer")
 
 
 @contextmanager
@@ -17,3 +21,21 @@ def threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def at_once(jobs: Sequence[Callable[[], Answer]], device: torch.device) -> list[Answer]:
+    """The answers of all jobs, on a CPU each computed by one thread, as many side by side as PyTorch may use.
+
+    So an answer has the same bits however many threads there are. An interrupt waits for the jobs that have begun.
+    """
+    if device.type != "cpu":
+        return [job() for job in jobs]
+    count, derivatives = min(torch.get_num_threads(), len(jobs)), torch.is_grad_enabled()
+
+    def answer(job: Callable[[], Answer]) -> Answer:
+        # Whether derivatives are kept belongs to a thread.
+        with torch.set_grad_enabled(derivatives):
+            return job()
+
+    with threads(1), ThreadPoolExecutor(count) as pool:
+        return list(pool.map(answer, jobs)) if count > 1 else [answer(job) for job in jobs]

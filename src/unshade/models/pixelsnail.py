@@ -7,8 +7,7 @@ followed by causal attention over everything before. `forward` runs over a whole
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -17,7 +16,7 @@ from torch import Tensor, nn
 
 from unshade.models import sampling
 from unshade.models.config import PriorConfig
-from unshade.threads import threads
+from unshade.threads import at_once
 
 AT_ONCE = 128
 """Maps that a CPU draws as one batch: 1.5 MB are kept of each in the small configuration, and more at once are not faster there."""
@@ -197,7 +196,7 @@ class PixelSNAIL(nn.Module):
             with torch.inference_mode(), torch.autocast(part.device.type, enabled=False):
                 return draw(self.begun(part, entries), entries, chances, temperature).unflatten(1, (self.size, self.size))
 
-        return torch.cat(_at_once([partial(drawn, *part) for part in parts], condition.device))
+        return torch.cat(at_once([partial(drawn, *part) for part in parts], condition.device))
 
     def begun(self, condition: Tensor, entries: Tensor) -> sampling.State:
         """Before the first code is drawn."""
@@ -261,15 +260,3 @@ def _parts(condition: Tensor, chances: Sequence[Tensor]) -> list[tuple[Tensor, T
         shares = min(torch.get_num_threads(), len(part) // OF_A_THREAD) if condition.device.type == "cpu" else 1
         found += list(zip(part.tensor_split(max(shares, 1)), numbers.tensor_split(max(shares, 1), 1), strict=True))
     return found
-
-
-def _at_once(jobs: Sequence[Callable[[], Tensor]], device: torch.device) -> list[Tensor]:
-    """The answers of all jobs, on a CPU each computed by a thread of its own: twice as fast as one job after the other by two threads.
-
-    An interrupt waits for those that have begun, a second or three.
-    """
-    count = min(torch.get_num_threads(), len(jobs)) if device.type == "cpu" else 1
-    if count == 1:
-        return [job() for job in jobs]
-    with threads(1), ThreadPoolExecutor(count) as pool:
-        return list(pool.map(lambda job: job(), jobs))
