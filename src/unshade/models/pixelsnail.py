@@ -56,12 +56,11 @@ class CausalConvolution(nn.Module):
 
     def begun(self, count: int, width: int) -> sampling.Convolution:
         """Before the first of so many maps is drawn."""
-        weight = (self.convolution.weight * self.kept).permute(2, 3, 1, 0)
-        across, inputs = weight.shape[1:3]
-        rows = weight.new_zeros(count, width + 1 + self.right, 2, inputs)
-        orders = (weight.flip(0), weight)
-        weights = torch.stack([order.transpose(0, 1).reshape(2 * across * inputs, -1) for order in orders])
-        return sampling.Convolution(rows, weights, _bias(self.convolution))
+        weight = (self.convolution.weight * self.kept).permute(2, 3, 1, 0).flatten(0, 1)
+        zeros = weight.new_zeros(count, weight.shape[1])
+        rows = [[zeros] * (width + 1 + self.right) for _ in range(2)]
+        # What is not kept is what comes last.
+        return sampling.Convolution(rows, self.right, weight[: int(self.kept.sum())].flatten(0, 1))
 
 
 class GatedLayer(nn.Module):
@@ -87,8 +86,10 @@ class GatedLayer(nn.Module):
     def begun(self, condition: Tensor, size: int) -> sampling.Layer:
         """Before the first map is drawn: the whole condition (L, N, D) is known, and read at once."""
         first, second = (convolution.begun(condition.shape[1], size) for convolution in (self.first, self.second))
-        aside = self.first.kept.new_empty(0, 0) if self.aside is None else self.aside.weight.T
-        return sampling.Layer(_scaled(self.gain), first, aside, second, _each(self.told, condition) + second.bias)
+        if self.aside is not None:
+            first = first._replace(weights=torch.cat([first.weights, self.aside.weight.T]))
+        told = _each(self.told, condition) + _bias(self.second.convolution)
+        return sampling.Layer(_scaled(self.gain), first, _bias(self.first.convolution), second, list(told))
 
 
 class CausalAttention(nn.Module):
@@ -119,11 +120,24 @@ class CausalAttention(nn.Module):
         out = F.scaled_dot_product_attention(self._split(queries), self._split(keys), self._split(values), is_causal=True)
         return out.transpose(1, 2).flatten(2).transpose(1, 2).unflatten(2, (height, width))
 
-    def begun(self, count: int, length: int) -> sampling.Attention:
-        """Before the first code is drawn, with the empty key and value."""
-        offered = self.offer.weight.new_zeros(2, count, self.heads, length + 1, self.offer.out_features // 2 // self.heads)
-        weights = (self.ask.weight.T, self.ask.bias, self.offer.weight.T, self.offer.bias)
-        return sampling.Attention(_scaled(self.gain), *weights, offered)
+    def begun(self, count: int, places: Tensor) -> sampling.Attention:
+        """Before the first code is drawn, with the empty key and value; places (L, 2)."""
+        channels, width = len(self.gain), len(self.gain) // self.heads
+        ask, ask_bias = (part * width**-0.5 for part in (self.ask.weight.T, self.ask.bias))
+        # Keys and values of a head side by side.
+        offer, offer_bias = (
+            part.unflatten(-1, (2, self.heads, width)).transpose(-3, -2).flatten(-3) for part in (self.offer.weight.T, self.offer.bias)
+        )
+        keys = ask.new_zeros(count * self.heads, width, len(places) + 1)
+        return sampling.Attention(
+            _scaled(self.gain),
+            ask[:channels],
+            list(ask_bias + places @ ask[channels:]),
+            offer[:-2],
+            list(offer_bias + places @ offer[-2:]),
+            keys,
+            keys.mT.contiguous(),
+        )
 
 
 class Block(nn.Module):
@@ -136,10 +150,10 @@ class Block(nn.Module):
         self.attention = CausalAttention(config.channels, inputs, config.heads)
         self.join = GatedLayer(*sizes, aside=True)
 
-    def begun(self, condition: Tensor, size: int) -> sampling.Block:
-        """Before the first code is drawn: condition (L, N, D)."""
+    def begun(self, condition: Tensor, size: int, places: Tensor) -> sampling.Block:
+        """Before the first code is drawn: condition (L, N, D), places (L, 2)."""
         layers = [layer.begun(condition, size) for layer in self.layers]  # type: ignore[operator]
-        return sampling.Block(layers, self.attention.begun(condition.shape[1], size * size), self.join.begun(condition, size))
+        return sampling.Block(layers, self.attention.begun(condition.shape[1], places), self.join.begun(condition, size))
 
 
 class PixelSNAIL(nn.Module):
@@ -201,15 +215,14 @@ class PixelSNAIL(nn.Module):
     def begun(self, condition: Tensor, entries: Tensor) -> sampling.State:
         """Before the first code is drawn."""
         condition = condition.flatten(2).permute(2, 0, 1).contiguous()
-        table = _table(entries)
+        table, places = _table(entries), self.places[0].flatten(1).T.contiguous()
         return sampling.State(
             self.enter.begun(condition.shape[1], self.size),
-            _each(self.told, condition),
-            [block.begun(condition, self.size) for block in self.blocks],  # type: ignore[operator]
+            list(_each(self.told, condition) + _bias(self.enter.convolution)),
+            [block.begun(condition, self.size, places) for block in self.blocks],  # type: ignore[operator]
             _scaled(self.gain),
             self.leave.weight.T + self.aim.weight.T @ table,
             self.leave.bias + self.aim.bias @ table,
-            self.places[0].flatten(1).T.contiguous(),
         )
 
     @torch.no_grad()

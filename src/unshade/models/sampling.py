@@ -20,13 +20,14 @@ NO_SCRIPT = (3, 14)
 
 
 class Convolution(NamedTuple):
-    """A causal convolution. It keeps two rows, which take turns, so that what a position sees of both lies in one piece."""
+    """A causal convolution. It keeps two rows, which take turns."""
 
-    rows: Tensor
-    """(N, W + what is beyond both ends, 2, C)."""
+    rows: list[list[Tensor]]
+    """Features (N, C) at each place of both, zeros beyond their ends."""
+    ahead: int
+    """Places of the row above that are seen to the right."""
     weights: Tensor
-    """(2, places seen * C, outputs): which of the two is the row above changes with every row, so they are kept in both orders."""
-    bias: Tensor
+    """(places seen * C, outputs)."""
 
 
 class Layer(NamedTuple):
@@ -34,11 +35,11 @@ class Layer(NamedTuple):
 
     gain: Tensor
     first: Convolution
-    aside: Tensor
-    """(C, C), or (0, 0)."""
+    bias: Tensor
+    """Of ``first``, whose weights end with those of what comes from aside, if anything does."""
     second: Convolution
-    told: Tensor
-    """(L, N, 2 C), of the condition, with the bias of ``second``."""
+    told: list[Tensor]
+    """(N, 2 C) at each position, of the condition, with the bias of ``second``."""
 
 
 class Attention(NamedTuple):
@@ -46,11 +47,14 @@ class Attention(NamedTuple):
 
     gain: Tensor
     ask: Tensor
-    ask_bias: Tensor
+    ask_bias: list[Tensor]
+    """(C) at each position: where it is belongs to the question."""
     offer: Tensor
-    offer_bias: Tensor
-    offered: Tensor
-    """(2, N, heads, L + 1, C / heads): all keys and values, those of nothing first."""
+    offer_bias: list[Tensor]
+    keys: Tensor
+    """(N * heads, C / heads, L + 1), the first one of nothing."""
+    values: Tensor
+    """(N * heads, L + 1, C / heads)"""
 
 
 class Block(NamedTuple):
@@ -65,57 +69,53 @@ class State(NamedTuple):
     """A network that is being drawn from: its weights as a step wants them, and what is kept."""
 
     enter: Convolution
-    told: Tensor
-    """(L, N, C)."""
+    told: list[Tensor]
+    """(N, C) at each position, of the condition, with the bias of ``enter``."""
     blocks: list[Block]
     gain: Tensor
     leave: Tensor
     """(C, K)."""
     leave_bias: Tensor
-    places: Tensor
-    """(L, 2)."""
 
 
 def unit(x: Tensor) -> Tensor:
     """Features (N, C, ...) divided by their length, or by a thousandth of the usual one where they have none."""
-    return F.normalize(x, dim=1, eps=1e-3 * x.size(1) ** 0.5)
+    return x / torch.linalg.vector_norm(x, 2.0, [1], True).clamp_min(1e-3 * x.size(1) ** 0.5)
 
 
 def _normal(x: Tensor, gain: Tensor) -> Tensor:
     return F.elu(unit(x) * gain)
 
 
-def _convolved(layer: Convolution, row: int, column: int, x: Tensor, bias: Tensor) -> Tensor:
-    """Put the features (N, C) of a position, and take what the layer makes of them and those before."""
-    layer.rows[:, column + 1, row % 2] = x
-    return torch.addmm(bias, layer.rows[:, column : column + 2].flatten(1), layer.weights[row % 2])
+def _seen(layer: Convolution, row: int, column: int) -> list[Tensor]:
+    """What a position sees of those before."""
+    above, here = layer.rows[(row + 1) % 2], layer.rows[row % 2]
+    return above[column : column + 2 + layer.ahead] + [here[column]]
 
 
-def _gated(layer: Layer, row: int, column: int, position: int, x: Tensor, aside: Tensor) -> Tensor:
-    inner = _convolved(layer.first, row, column, _normal(x, layer.gain), layer.first.bias)
-    if layer.aside.numel():
-        inner = torch.addmm(inner, aside, layer.aside)
-    return x + F.glu(_convolved(layer.second, row, column, F.elu(inner), layer.told[position]), 1)
-
-
-def _asked(attention: Attention, x: Tensor, place: Tensor) -> Tensor:
-    return torch.cat([unit(x) * attention.gain, place.expand(x.size(0), 2)], 1)
+def _gated(layer: Layer, row: int, column: int, position: int, x: Tensor, aside: list[Tensor]) -> Tensor:
+    inner = _normal(x, layer.gain)
+    layer.first.rows[row % 2][column + 1] = inner
+    inner = F.elu(torch.addmm(layer.bias, torch.cat(_seen(layer.first, row, column) + [inner] + aside, 1), layer.first.weights))
+    layer.second.rows[row % 2][column + 1] = inner
+    both = torch.addmm(layer.told[position], torch.cat(_seen(layer.second, row, column) + [inner], 1), layer.second.weights)
+    return x + F.glu(both, 1)
 
 
 def _looked(attention: Attention, position: int, asked: Tensor) -> Tensor:
     """What attention finds (N, C) before a position."""
-    heads, width = attention.offered.size(2), attention.offered.size(4)
-    query = torch.addmm(attention.ask_bias, asked, attention.ask).view(-1, heads, 1, width)
-    keys, values = attention.offered[0, :, :, : position + 1], attention.offered[1, :, :, : position + 1]
+    query = torch.addmm(attention.ask_bias[position], asked, attention.ask).view(attention.keys.size(0), 1, -1)
     # One query a head: two products are faster than the fused attention, which is made for many.
-    return torch.matmul(torch.softmax(torch.matmul(query, keys.transpose(2, 3)) * width**-0.5, 3), values).flatten(1)
+    shares = torch.softmax(torch.bmm(query, attention.keys.narrow(2, 0, position + 1)), 2)
+    return torch.bmm(shares, attention.values.narrow(1, 0, position + 1)).view(asked.size(0), -1)
 
 
 def _offered(attention: Attention, position: int, asked: Tensor, seen: Tensor) -> None:
     """Offer a position to later ones, now that its code is drawn."""
-    heads, width = attention.offered.size(2), attention.offered.size(4)
-    offered = torch.addmm(attention.offer_bias, torch.cat([asked[:, :-2], seen, asked[:, -2:]], 1), attention.offer)
-    attention.offered[:, :, :, position + 1] = offered.view(-1, 2, heads, width).transpose(0, 1)
+    offered = torch.addmm(attention.offer_bias[position], torch.cat([asked, seen], 1), attention.offer)
+    offered = offered.view(attention.keys.size(0), 2, -1)
+    attention.keys.select(2, position + 1).copy_(offered.select(1, 0))
+    attention.values.select(1, position + 1).copy_(offered.select(1, 1))
 
 
 def pick(logits: Tensor, chance: Tensor, temperature: float) -> Tensor:
@@ -147,18 +147,17 @@ def draw(state: State, entries: Tensor, chances: Tensor, temperature: float) -> 
     drawn = torch.zeros([count, length], dtype=torch.int64, device=entries.device)
     for position in range(length):
         row, column = position // size, position % size
-        rows = state.enter.rows
-        x = torch.addmm(state.enter.bias, rows[:, column : column + 3].flatten(1), state.enter.weights[row % 2]) + state.told[position]
+        x = torch.addmm(state.told[position], torch.cat(_seen(state.enter, row, column), 1), state.enter.weights)
         asked: list[Tensor] = []
         for block in state.blocks:
             for layer in block.layers:
-                x = _gated(layer, row, column, position, x, x)
-            asked.append(_asked(block.attention, x, state.places[position]))
-            x = _gated(block.join, row, column, position, x, _looked(block.attention, position, asked[-1]))
+                x = _gated(layer, row, column, position, x, [])
+            asked.append(unit(x) * block.attention.gain)
+            x = _gated(block.join, row, column, position, x, [_looked(block.attention, position, asked[-1])])
         number = pick(torch.addmm(state.leave_bias, _normal(x, state.gain), state.leave), chances[position], temperature)
         drawn[:, position] = number
         seen = F.embedding(number, entries)
-        rows[:, column + 1, row % 2] = seen
+        state.enter.rows[row % 2][column + 1] = seen
         for k, block in enumerate(state.blocks):
             _offered(block.attention, position, asked[k], seen)
     return drawn
