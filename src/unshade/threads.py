@@ -37,5 +37,8 @@ def at_once(jobs: Sequence[Callable[[], Answer]], device: torch.device) -> list[
         with torch.set_grad_enabled(derivatives):
             return job()
 
-    with threads(1), ThreadPoolExecutor(count) as pool:
-        return list(pool.map(answer, jobs)) if count > 1 else [answer(job) for job in jobs]
+    with threads(1):
+        if count < 2:
+            return [job() for job in jobs]
+        with ThreadPoolExecutor(count) as pool:
+            return list(pool.map(answer, jobs))

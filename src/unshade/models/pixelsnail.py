@@ -128,15 +128,15 @@ class CausalAttention(nn.Module):
         offer, offer_bias = (
             part.unflatten(-1, (2, self.heads, width)).transpose(-3, -2).flatten(-3) for part in (self.offer.weight.T, self.offer.bias)
         )
-        keys = ask.new_zeros(count * self.heads, width, len(places) + 1)
+        looks, length = count * self.heads, len(places) + 1
         return sampling.Attention(
             _scaled(self.gain),
             ask[:channels],
             list(ask_bias + places @ ask[channels:]),
             offer[:-2],
             list(offer_bias + places @ offer[-2:]),
-            keys,
-            keys.mT.contiguous(),
+            ask.new_zeros(looks, width, length),
+            ask.new_zeros(looks, length, width),
         )
 
 
