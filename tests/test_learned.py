@@ -11,7 +11,7 @@ import json
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -112,6 +112,19 @@ def endless(networks: Networks) -> Networks:
 
     heads: Any = SimpleNamespace(operator=networks.heads.operator, mask=networks.heads.mask, types=forever)
     return dataclasses.replace(networks, heads=heads)
+
+
+def test_the_second_stage_takes_up_a_third_pool_only_while_few_nodes_are_left_over() -> None:
+    def left_over(*images: torch.Tensor) -> Pool:
+        # Pools that share a node hold parts of their own with one image.
+        return Pool(tuple(Part(image, cast(Codes, None), "operator", "left over", 1) for image in images))
+
+    nodes = [torch.zeros(1) for _ in range(learned.SECOND_NODES + 1)]
+    first, second = left_over(*nodes[:-2]), left_over(*nodes[1:-1])
+    assert learned.taken_up([first, second, first]) == [first, second, first], "six, some of them in all"
+    assert learned.taken_up([first, second, left_over(nodes[-1]), first]) == [first, second]
+    large = left_over(*nodes)
+    assert learned.taken_up([large, second, first]) == [large, second], "two always"
 
 
 def test_a_pool_has_a_largest_size(networks: Networks) -> None:
