@@ -22,8 +22,7 @@ from unshade.serde import load, load_family
 
 
 @pytest.fixture(autouse=True)
-def _as_the_program_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTORCH_JIT", "0")
+def _as_the_program_runs() -> None:
     # A shell has its background work ignore interrupts, which a child would inherit.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -151,6 +151,14 @@ def test_where_there_is_no_torchscript_codes_are_drawn_all_the_same(monkeypatch:
     assert sampling.compiled.__wrapped__() is sampling.draw
 
 
+@pytest.mark.parametrize("heads", [1, 16])
+def test_the_cache_holds_heads_of_all_channels_and_of_one(heads: int) -> None:
+    net = PixelSNAIL(4, 16, 8, dataclasses.replace(DRAWN.prior, heads=heads)).double().eval()
+    entries, condition = torch.randn(16, 8).double(), torch.randn(3, 16, 4, 4).double()
+    fast, slow = (draw(entries, condition, torch.Generator().manual_seed(7)) for draw in (net.sample, net.sample_uncached))
+    assert torch.equal(fast, slow)
+
+
 @pytest.mark.parametrize("count", [1, 9, 13])
 def test_threads_share_the_maps_and_draw_the_same_codes(count: int) -> None:
     """In TorchScript and, as on a GPU, without it."""

@@ -206,12 +206,18 @@ class Log:
             return file.read(1) == b"\n"
 
 
-def limit_threads(method: str = "search") -> None:
-    """One thread of arithmetic in this process: sums come in one order, so results do not depend on the cores or the workers."""
-    if method == "search" and "torch" not in sys.modules:
-        # PyTorch compiles a table of derivatives that is not used here, for 0.5 s, when forward-mode differentiation begins. This is
-        # read while it loads, and forbids TorchScript, by which the codes of networks are drawn.
+def forgo_torchscript() -> None:
+    """For a search or a fit, before PyTorch loads, here and in processes started from here.
+
+    PyTorch compiles a table of derivatives that is not used here, for half a second, when forward-mode differentiation begins, unless
+    TorchScript is off; and it must not be off where networks draw codes.
+    """
+    if "torch" not in sys.modules:
         os.environ["PYTORCH_JIT"] = "0"
+
+
+def limit_threads() -> None:
+    """One thread of arithmetic in this process: sums come in one order, so results do not depend on the cores or the workers."""
     import torch
 
     torch.set_num_threads(1)
@@ -235,7 +241,7 @@ def decompose_picture(job: Job, on_step: Callable[[Step], None] | None = None) -
 
 
 def _decompose_picture(job: Job, on_step: Callable[[Step], None] | None) -> Record:
-    limit_threads(job.settings.method)
+    limit_threads()
     begin, settings, sphere = time.perf_counter(), job.settings, _read(job)
     from unshade.decompose import decompose
     from unshade.threads import threads

@@ -161,6 +161,8 @@ def decompose(
     from unshade.terminal import Messages
 
     settings, folder = _settings(output, options)
+    if settings.method == "search":
+        batch.forgo_torchscript()
     messages = Messages(quiet, bars=not (as_json and sys.stdout.isatty()))
     pictures = batch.find_pictures(images)
     log = batch.Log(folder)
@@ -260,6 +262,7 @@ def fit(
 
     if (structure is None) == (source is None):
         raise click.UsageError("give either --structure TEXT or --from TREE")
+    batch.forgo_torchscript()
     tree = read_tree(structure, text_only=True) if structure is not None else read_tree(str(source))
     settings, folder = _settings(output, options)
     log = batch.Log(folder)

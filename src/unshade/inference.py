@@ -305,7 +305,8 @@ def _drawn(parts: Sequence[Part], networks: Networks, settings: Inference, gener
         codes = left_codes, right_codes
         through, same = _decoded(vqvae, codes), parents
     else:
-        through, same = images, vqvae.decode(given).repeat_interleave(settings.samples, 0)
+        (told,) = at_once([partial(vqvae.decode, given)], parents.device)
+        through, same = images, told.repeat_interleave(settings.samples, 0)
     weigh = (settings.similar, settings.blank, settings.white, settings.drawn if settings.remainders else 0.0)
     terms = criterion(parents, same, first, through, images, numbers, masks, weigh)
     return _Drawn(images, codes, operators, known, kinds, terms)

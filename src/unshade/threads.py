@@ -40,5 +40,6 @@ def at_once(jobs: Sequence[Callable[[], Answer]], device: torch.device) -> list[
     with threads(1):
         if count < 2:
             return [job() for job in jobs]
-        with ThreadPoolExecutor(count) as pool:
+        # A new thread begins with all cores, until its first operation asks how many it may use; not every one does.
+        with ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,)) as pool:
             return list(pool.map(answer, jobs))

@@ -1,8 +1,8 @@
 """Codes of a `PixelSNAIL` drawn one after the other: a new code costs one step over what is kept of those before, not a pass over the map.
 
-A step is three hundred small operations, between which Python takes as long as the processor takes for them. So `draw` is written in the
-part of Python that is TorchScript too, and on a CPU runs as that: no interpreter between the operations, and none to wait for in another
-thread.
+A step is a hundred and sixty small operations, between which Python takes as long as the processor takes for them. So `draw` is written
+in the part of Python that is TorchScript too, and on a CPU runs as that: no interpreter between the operations, and none to wait for in
+another thread.
 """
 
 import sys
