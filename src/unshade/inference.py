@@ -227,7 +227,7 @@ def infer(image: Image, networks: Networks, settings: Inference, seed: int) -> I
 
     Args:
         image: (3, S, S) from `node_image`.
-        seed: of all samples. The same seed gives the same pools on the same machine, however many threads.
+        seed: of all samples. The same seed gives the same pools on the same machine.
     """
     generator = torch.Generator(networks.device).manual_seed(seed)
     with torch.no_grad():

@@ -115,7 +115,10 @@ def _settings(method: str) -> tuple[Any, ...]:
     preset = PRESETS[name.argument] if name.argument in PRESETS else PRESETS["balanced"] if name.kind in ("search", *NETWORKS) else None
     networks = {"learned": VARIANTS.get(name.argument or "full"), "hybrid": Settings()}.get(name.kind)
     finish = (learned.SURVIVORS, pruning.REMOVED)
-    fixed = {"learned": (learned.PLACED_STEPS, learned.WHOLE_STEPS, *finish, second_stage.NODE_EFFORT), "hybrid": finish}.get(name.kind, ())
+    fixed = {
+        "learned": (learned.PLACED_STEPS, learned.WHOLE_STEPS, learned.SECOND_NODES, *finish, second_stage.NODE_EFFORT),
+        "hybrid": finish,
+    }.get(name.kind, ())
     return preset, networks, fixed
 
 
