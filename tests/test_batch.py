@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 from unshade import batch, crew
 from unshade.batch import Job, Log, Settings, assign_folders, find_pictures, folder_name
@@ -249,3 +250,81 @@ def test_settings_are_told_apart_by_their_fingerprint(picture: Path) -> None:
 
 def test_cores_is_a_positive_number() -> None:
     assert 1 <= batch.cores() <= (os.cpu_count() or 1)
+
+
+def test_jobs_side_by_side_answer_in_order_and_change_nothing_here() -> None:
+    told: list[int] = []
+
+    def job(number: int) -> tuple[int, int, torch.Tensor]:
+        told.append(number)
+        time.sleep(0.2 if number == 0 else 0.0)
+        return number, os.getpid(), torch.full((2,), float(number))
+
+    jobs = [functools.partial(job, number) for number in range(5)]
+    found = list(crew.side_by_side(jobs, 2))
+    assert [number for number, _, _ in found] == [0, 1, 2, 3, 4]
+    assert all(torch.equal(tensor, torch.full((2,), float(number))) for number, _, tensor in found)
+    copies = {process for _, process, _ in found}
+    if sys.platform == "linux":
+        assert len(copies) == 2 and os.getpid() not in copies and not told
+    assert {process for _, process, _ in crew.side_by_side(jobs, 1)} == {os.getpid()} and told[-5:] == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+def test_what_fails_in_a_copy_is_done_again_here() -> None:
+    here = os.getpid()
+
+    def dies() -> str:
+        if os.getpid() != here:
+            os._exit(9)
+        return "here"
+
+    def raises() -> str:
+        raise ArithmeticError(f"in {os.getpid()}")
+
+    assert list(crew.side_by_side([dies, lambda: "there", dies], 2)) == ["here", "there", "here"]
+    answers = crew.side_by_side([lambda: "first", raises], 2)
+    assert next(answers) == "first"
+    with pytest.raises(ArithmeticError, match=str(here)):
+        next(answers)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+def test_copies_end_with_what_asked_for_them() -> None:
+    def sleeps() -> int:
+        time.sleep(60.0)
+        return 0
+
+    begin = time.monotonic()
+    answers = crew.side_by_side([os.getpid, sleeps, sleeps], 2)
+    copy = next(answers)
+    answers.close()
+    assert time.monotonic() - begin < 20
+    with pytest.raises(ProcessLookupError):
+        os.kill(copy, 0)
+    # Killed, this process leaves none behind, although each copy holds what the next one knows of the pipes.
+    script = f"""
+import os, sys, time
+sys.path[:0] = {sys.path!r}
+from unshade import crew
+def lasts():
+    print(os.getpid(), flush=True)
+    time.sleep(2.0)
+list(crew.side_by_side([lasts] * 4, 2))
+"""
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        copies = [int(parent.stdout.readline()) for _ in range(2)]
+        parent.kill()
+    deadline = time.monotonic() + 30
+    while any(_runs(copy) for copy in copies) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(_runs(copy) for copy in copies)
+
+
+def _runs(process: int) -> bool:
+    try:
+        # A process that has ended, and whose parent has not asked yet, is a zombie.
+        return (Path("/proc") / str(process) / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False

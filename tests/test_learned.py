@@ -28,12 +28,13 @@ from unshade.models import weights
 from unshade.models.config import find
 from unshade.models.vqvae import Codes
 from unshade.node_image import node_image
-from unshade.nodes import Leaf, Node, Operator, Tree, count_values, leaf, mix, multiply, screen, walk
+from unshade.nodes import Leaf, Node, Operator, Tree, leaf, mix, multiply, screen, walk
 from unshade.parameters import Layout
 from unshade.pictures import write_picture
 from unshade.proposals import Fits, arranged
 from unshade.render import evaluate, render
 from unshade.sphere import disc_mask, sphere_normals
+from unshade.types import Image
 
 SIZE = 32
 SETTINGS = Inference(samples=3, stop=10.0, depth=2, hidden=0.0)
@@ -406,25 +407,45 @@ def test_undoing_the_operators_gives_what_a_node_shows() -> None:
 
 def test_a_node_that_shows_little_of_itself_gets_few_values() -> None:
     stage = second_stage.SecondStage(SimpleNamespace(), Fits())  # type: ignore[arg-type]
-    pixels = Pixels.of(picture(PAINTED), None, 40)
-    sizes = [Tree(stage._of_node(pixels, second_stage._room(gain))).values for gain in (0.01, 0.25, 1.0)]
+    codes, image = Codes(*[torch.zeros(1)] * 4), picture(PAINTED, 64)
+    sizes = []
+    for gain in (0.01, 0.25, 1.0):
+        part = Part(image, codes, "operator", "left over", 1, gain=torch.full_like(image, gain))
+        assert second_stage.gain_of(part) == pytest.approx(gain)
+        sizes.append(Tree(stage.decompose(part).root).values)
     most = second_stage.NODE_EFFORT.max_values
     assert sizes[0] == 3 < sizes[1] <= most / 2 < sizes[2] <= most
+    assert second_stage.gain_of(dataclasses.replace(part, gain=None)) == 1.0
+    half = torch.full_like(image, 1.0) * (torch.arange(64) < 32)
+    assert second_stage.gain_of(dataclasses.replace(part, gain=half)) == pytest.approx(0.5**0.5, abs=0.01)
 
 
-def test_what_several_pools_leave_over_is_decomposed_once() -> None:
-    stage = second_stage.SecondStage(SimpleNamespace(samples=SimpleNamespace(coarse=Pixels.of(picture(PAINTED)))), Fits())  # type: ignore[arg-type]
-    codes, body = Codes(*[torch.zeros(1)] * 4), picture(PAINTED.children[0], 64)  # type: ignore[union-attr]
-    left = Part(body, codes, "operator", "left over", 1)
-    root = Part(picture(PAINTED, 64), codes, "operator", "split", 0, operator="screen", children=(1, 2))
-    light = PAINTED.children[1]  # type: ignore[union-attr]
-    pools = [Pool((root, dataclasses.replace(left, cause=cause), left)) for cause in ("draws", "loss")]
-    first = stage.decompose(pools[0], 1, {2: light})
-    fits = stage.count
-    assert fits > 0 and stage.decompose(pools[1], 1, {2: light}) is first and stage.count == fits
-    # Where its siblings leave it less room, it is another question.
-    smaller = stage.decompose(pools[1], 1, {2: leaf("albedo", color=(0.9, 0.9, 0.9))})
-    assert stage.count > fits and count_values(smaller) < count_values(first)
+def test_what_several_pools_leave_over_is_decomposed_once(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Image] = []
+    decompose_ = second_stage.SecondStage.decompose
+
+    def noted(self: second_stage.SecondStage, part: Part) -> second_stage.Found:
+        asked.append(part.image)
+        return decompose_(self, part)
+
+    monkeypatch.setattr(second_stage.SecondStage, "decompose", noted)
+    # Nothing is good enough, so each pool leaves its root over.
+    settings = learned.Settings(dataclasses.replace(SETTINGS, stop=-1.0), threads=1)
+    found = decompose(picture(SIMPLE), method="learned", weights=tiny, preset="draft", settings=settings).result()
+    assert len(asked) == 1 and found.stages is not None and found.stages["second_stage_fits"] > 1
+    asked.clear()
+    few = learned.Settings(dataclasses.replace(SETTINGS, stop=10.0, draws=4, trees=3), threads=1)
+    decompose(picture(PAINTED), method="learned", weights=tiny, preset="draft", settings=few).result()
+    assert len(asked) == len(set(asked))
+
+
+@pytest.mark.parametrize("second", ["size", "none"])
+def test_copies_of_the_process_change_no_tree(second: Any, tiny: Path) -> None:
+    inference = dataclasses.replace(SETTINGS, stop=10.0, draws=4, trees=3)
+    settings = [learned.Settings(inference, second_stage=second, threads=count) for count in (1, 2)]
+    one, two = (decompose(picture(PAINTED), method="learned", weights=tiny, preset="draft", settings=given).result() for given in settings)
+    assert one.tree == two.tree and one.family == two.family and one.stages is not None and two.stages is not None
+    assert {**one.stages, "seconds": 0} == {**two.stages, "seconds": 0} and one.stages["seconds"].keys() == two.stages["seconds"].keys()
 
 
 def test_looking_at_a_node_in_its_place_mends_what_was_decoded_badly(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -492,11 +513,14 @@ def test_the_largest_size_is_kept(tiny: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_papers_second_stage(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("stop", "left_over"), [(-1.0, 1), (10.0, 2)], ids=["of the picture", "of two nodes, side by side"])
+def test_the_papers_second_stage(stop: float, left_over: int, networks: Networks, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(second_stage, "NODE_BUDGET", search_depth.Budget(ranked=4, fitted=1, extended=1))
-    settings = learned.Settings(dataclasses.replace(SETTINGS, stop=-1.0), second_stage="depth")
-    found = decompose(picture(SIMPLE, 64), method="learned", weights=tiny, settings=settings, preset="draft").result()
-    assert found.stages is not None and found.stages["second_stage_fits"] >= 5 and found.tree.leaves >= 1
+    monkeypatch.setattr(Networks, "load", lambda *_: endless(networks))
+    settings = learned.Settings(dataclasses.replace(SETTINGS, stop=stop, draws=1, trees=1), second_stage="depth", threads=2)
+    found = decompose(picture(SIMPLE, 64), method="learned", settings=settings, preset="draft").result()
+    assert found.stages is not None and found.stages["second_stage_nodes"] == left_over
+    assert found.stages["second_stage_fits"] >= 5 * left_over and found.tree.leaves >= 1
 
 
 def test_without_weights_learned_says_so_and_the_rest_goes_on(tmp_path: Path) -> None:

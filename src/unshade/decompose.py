@@ -28,7 +28,8 @@ from unshade.starts import read_off
 from unshade.threads import threads
 
 if TYPE_CHECKING:
-    from unshade.learned import Hybrid, Learned, SecondStageName, Settings
+    from unshade.hybrid import Hybrid
+    from unshade.learned import Learned, SecondStageName, Settings
 
 METHODS = ("search", "learned", "hybrid")
 """Who proposes structures: the search, networks with a second stage as in the paper, or networks and the search together."""
@@ -286,7 +287,7 @@ def _learned(
     settings: Settings | None,
 ) -> Begin:
     """A method with networks; the search where the hybrid has none. Raises UnshadeError, MissingWeightsError, WeightsError."""
-    from unshade import learned
+    from unshade import hybrid, learned
     from unshade.inference import Networks
 
     given = settings or learned.Settings(second_stage=second_stage, objective=objective, device=device)
@@ -300,8 +301,8 @@ def _learned(
     except MissingWeightsError as error:
         if method == "learned":
             raise
-        return partial(learned.Unproposed, why=error.reason)
-    main = learned.Learned if method == "learned" else learned.Hybrid
+        return partial(hybrid.Unproposed, why=error.reason)
+    main = learned.Learned if method == "learned" else hybrid.Hybrid
     return lambda samples, effort: main(sphere.image, sphere.valid, samples, effort, networks, given, seed)
 
 

@@ -167,6 +167,10 @@ class Part:
         """`remainders.contrast` in the picture."""
         return float(contrast(self.image, torch.ones_like(self.image) if self.gain is None else self.gain))
 
+    def cpu(self) -> Part:
+        """Its picture and gain on the CPU, where fits are."""
+        return dataclasses.replace(self, image=self.image.cpu(), gain=None if self.gain is None else self.gain.cpu())
+
 
 @dataclass(frozen=True, eq=False)
 class Pool:

@@ -1,7 +1,7 @@
-"""The methods that networks propose trees for: the paper's (`Learned`), and the search that starts from several proposals (`Hybrid`).
+"""The paper's method: networks propose a tree, searches and fits finish it.
 
-`Learned` is the paper's pipeline: the first stage (`inference`), a second stage for the nodes left over (`second_stage`), the parametric
-fit of every leaf, the optimisation of the whole tree. Deviations from the paper, beyond those of `inference`:
+The first stage (`inference`), a second stage for the nodes left over (`second_stage`), the parametric fit of every leaf, the
+optimisation of the whole tree. Deviations from the paper, beyond those of `inference`:
 
 - the fits are second order on pixels, not BasinCMA on pixels and VGG features; ``second_stage="depth"`` is the paper's own;
 - nodes that were left over are looked at twice, the second time in their place (``in_place``);
@@ -15,24 +15,22 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from functools import partial
+from typing import Any, Literal, TypeVar, get_args
 
 import torch
 
-from unshade.changes import removals, swaps
-from unshade.fit.least_squares import FINE_SOFTNESS, error_of, fit_pixels
-from unshade.fit.model import soften
-from unshade.growth import FLOOR, Candidate, Effort, Growth, Samples
+from unshade.crew import side_by_side
+from unshade.fit.least_squares import error_of
+from unshade.growth import Candidate, Effort, Front, Growth, Samples
 from unshade.inference import Cause, Inference, Networks, Pool, Round, infer
 from unshade.node_image import node_image
 from unshade.nodes import Node, count_values
 from unshade.proposals import Fits
 from unshade.pruning import least_useful, within
-from unshade.search import Search
-from unshade.search_drawn import DRAWN, SETTLED, settled
 from unshade.second_stage import SecondStage, SecondStageByDepth
 from unshade.threads import threads
 from unshade.types import Image, Mask
@@ -44,16 +42,15 @@ WHOLE_STEPS = 40
 """Most second-order steps of the whole tree on each set of pixels."""
 
 SURVIVORS = 2
-"""Trees of pools that are finished, by the hybrid beside the search's own. A third of `Learned` took a third more time for 0.25 dB."""
+"""Trees of pools that are finished, by the hybrid beside the search's own. A third took a third more time for 0.25 dB."""
 
 SECOND_NODES = 6
 """Different nodes that the second stage decomposes before a third pool adds to them. Without the third the trees of four development
 pictures that leave more over were as good or better (in the mean by 1.2 dB), in 0.7 to 1.0 of the time."""
 
-OFFERED = 4
-"""Changes of a proposal that are looked at closely."""
-
 SecondStageName = Literal["size", "depth", "none"]
+
+Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,8 @@ class Settings:
     device: str = "cpu"
     """Where the networks are; fits are on the CPU. Another device draws other samples from the same seed."""
     threads: int = 0
-    """Of the networks, on a CPU; 0 for as many as PyTorch uses when the work begins."""
+    """Of the networks, on a CPU, and copies of the process that decompose what they leave over and finish trees (`crew.side_by_side`);
+    0 for as many as PyTorch uses when the work begins."""
 
 
 @dataclass
@@ -130,7 +128,7 @@ class Stages:
         return found | {"seconds": {stage: round(seconds, 3) for stage, seconds in self.seconds.items()}}
 
 
-class _Proposing:
+class Proposing:
     """The first stage for one picture, and the trees of its pools."""
 
     def __init__(self, image: Image, valid: Mask, networks: Networks, settings: Settings, seed: int, stages: Stages) -> None:
@@ -170,7 +168,7 @@ class Learned(Growth):
         super().__init__(samples, effort)
         self.settings = settings
         self.stages = Stages("learned", second_stage=settings.second_stage)
-        self.proposing = _Proposing(image, valid, networks, settings, seed, self.stages)
+        self.proposing = Proposing(image, valid, networks, settings, seed, self.stages)
         fits = self.proposing.fits
         self.second = (
             SecondStageByDepth(self, fits, image, valid, settings.objective, seed)
@@ -185,58 +183,79 @@ class Learned(Growth):
         for found in self.proposing.rounds():
             best = min(best, self._rough(self.proposing.tree(found.pools[0])), key=lambda candidate: candidate.error)
             yield "propose", best
-        looked: list[tuple[Candidate, Pool, dict[int, Node]]] = []
         pools = self.proposing.pools if self.settings.second_stage == "none" else taken_up(self.proposing.pools)
+        known: dict[Image, Node] = {}
+        for image, root in self._decomposed(pools):
+            known[image] = root
+            yield "second stage", best
+        looked = []
         for pool in pools:
-            second: dict[int, Node] = {}
-            for rough in self._second_stage(pool, second):
-                best = min(best, rough, key=lambda candidate: candidate.error)
-                yield "second stage", best
-            looked.append((self._placed(pool, second), pool, second))
-        finished = []
-        for placed, pool, second in sorted(looked, key=lambda entry: self.judged(entry[0]))[:SURVIVORS]:
-            for better in self._in_place(placed, pool, second):
-                best = min(best, better, key=lambda candidate: candidate.error)
-                yield "second stage", best
-            root = self.proposing.tree(pool, second)
-            with self.stages.clock("whole tree"):
-                finished.append((self._finished(root), pool))
-        chosen, pool = min(finished, key=lambda entry: self.judged(entry[0]))
-        self.stages.chosen(pool)
-        self.stages.second_stage_fits = self.second.count
+            second = {place: known[image] for place in pool.left_over if (image := pool.parts[place].image) in known}
+            best = min(best, self._rough(self.proposing.tree(pool, second)), key=lambda candidate: candidate.error)
+            yield "second stage", best
+            with self.stages.clock("second stage"):
+                looked.append((self._placed(pool, second), pool, second))
+        survivors = sorted(looked, key=lambda entry: self.judged(entry[0]))[:SURVIVORS]
+        trees = []
+        in_place = self._side_by_side("second stage", [partial(self._in_place, *entry) for entry in survivors])
+        for (second, fits), (_, pool, _) in zip(in_place, survivors, strict=True):
+            self.stages.second_stage_fits += fits
+            trees.append(self.proposing.tree(pool, second))
+            best = min(best, self._rough(trees[-1]), key=lambda candidate: candidate.error)
+            yield "second stage", best
+        finished = list(self._side_by_side("whole tree", [partial(self._finished, root) for root in trees]))
+        place = min(range(len(finished)), key=lambda place: self.judged(finished[place]))
+        chosen = finished[place]
+        self.stages.chosen(survivors[place][1])
         yield "whole tree", chosen
         with self.stages.clock("family"):
             self._smaller(chosen)
 
-    def _second_stage(self, pool: Pool, second: dict[int, Node]) -> Iterator[Candidate]:
-        """Decompose what was left over, into ``second``; the tree after each node."""
-        for place in pool.left_over if self.settings.second_stage != "none" else ():
-            with self.stages.clock("second stage"):
-                second[place] = self.second.decompose(pool, place, second)
-            yield self._rough(self.proposing.tree(pool, second))
-
-    def _in_place(self, placed: Candidate, pool: Pool, second: dict[int, Node]) -> Iterator[Candidate]:
-        """Decompose it once more where it stands; the tree after each node that is better so."""
-        # A pool whose root is left over has no other parts, and the root is in its place already.
-        if not self.settings.in_place or not any(second):
+    def _decomposed(self, pools: Sequence[Pool]) -> Iterator[tuple[Image, Node]]:
+        """The nodes that pools leave over, each once, with their trees."""
+        if self.settings.second_stage == "none":
             return
-        for place in pool.left_over:
-            with self.stages.clock("second stage"):
-                found = self.second.in_place(pool, place, second)
+        parts = list({pool.parts[place].image: pool.parts[place] for pool in pools for place in pool.left_over}.values())
+        found = self._side_by_side("second stage", [partial(self.second.decompose, part.cpu()) for part in parts])
+        for part, (root, fits) in zip(parts, found, strict=True):
+            self.stages.second_stage_fits += fits
+            yield part.image, root
+
+    def _side_by_side(self, stage: str, jobs: Sequence[Callable[[], Answer]]) -> Iterator[Answer]:
+        """The answers of jobs, in order; what they add to the curve is added here."""
+
+        def noted(job: Callable[[], Answer]) -> tuple[Answer, Front, Front]:
+            return job(), self.rough, self.front
+
+        with closing(side_by_side([partial(noted, job) for job in jobs], self.settings.threads)) as answers:
+            while True:
+                with self.stages.clock(stage):
+                    found = next(answers, None)
+                if found is None:
+                    return
+                answer, rough, front = found
+                self.rough.update(rough)
+                self.front.update(front)
+                yield answer
+
+    def _in_place(self, placed: Candidate, pool: Pool, second: dict[int, Node]) -> tuple[dict[int, Node], int]:
+        """What was left over, each decomposed once more where it stands, if the tree is better so; and the fits that it took."""
+        fits = 0
+        # A pool whose root is left over has no other parts, and the root is in its place already.
+        for place in pool.left_over if self.settings.in_place and any(second) else ():
+            found = self.second.in_place(pool, place, second)
             if found is None:
                 continue
-            other = self._placed(pool, second | {place: found})
+            fits += found.fits
+            other = self._placed(pool, second | {place: found.root})
             if self.judged(other) < self.judged(placed):
-                placed, second[place] = other, found
-                yield self._rough(self.proposing.tree(pool, second))
+                placed, second = other, second | {place: found.root}
+        return second, fits
 
     def _placed(self, pool: Pool, second: dict[int, Node]) -> Candidate:
         """The tree of a pool after a short fit, or as it is where the whole tree is not optimised."""
-        root = self.proposing.tree(pool, second)
-        if not self.settings.overall:
-            return self._rough(root)
-        with self.stages.clock("second stage"):
-            return self.fit(root, self.samples.coarse, PLACED_STEPS)
+        root = self.proposing.fits.tree(pool, second)
+        return self.fit(root, self.samples.coarse, PLACED_STEPS) if self.settings.overall else self._rough(root)
 
     def _rough(self, root: Node) -> Candidate:
         """A tree as it is."""
@@ -277,96 +296,3 @@ def taken_up(pools: Sequence[Pool]) -> list[Pool]:
             break
         found.append(pool)
     return found
-
-
-class Hybrid(Search):
-    """Networks propose several trees, parameters included; the search finishes them, and one of its own, side by side.
-
-    A proposal that becomes a drawn picture to its rounding is the answer at once.
-    """
-
-    def __init__(
-        self, image: Image, valid: Mask, samples: Samples, effort: Effort, networks: Networks, settings: Settings, seed: int
-    ) -> None:
-        super().__init__(samples, effort)
-        self.stages = Stages("hybrid")
-        self.proposing = _Proposing(image, valid, networks, settings, seed, self.stages)
-
-    def run(self) -> Iterator[tuple[str, Candidate]]:
-        """(stage, candidate) as they come; the last one is the result."""
-        best = self.fit(self.start(), self.samples.coarse, 1)
-        yield "start", best
-        trees: list[tuple[Candidate, Pool]] = []
-        for found in self.proposing.rounds():
-            # What is still open is one colour in the tree of a round: the fit of a whole level costs little beside drawing it.
-            trees = [(self._proposed(pool), pool) for pool in found.pools]
-            best = min([best, *(candidate for candidate, _ in trees)], key=lambda candidate: candidate.error)
-            yield "propose", best
-        survivors = sorted(trees, key=lambda entry: self.judged(entry[0]))[:SURVIVORS]
-        finished: list[Candidate] = []
-        for proposed, pool in survivors:
-            with self.stages.clock("proposals"):
-                finished.append(self._settled(proposed))
-            if finished[-1].error < DRAWN:
-                self._decided("networks", pool)
-                yield "propose", finished[-1]
-                return
-        results = []
-        for stage, found_ in super().run():
-            yield stage, found_
-            results = [found_]
-        for current in finished:
-            for current in self.grow(current, self.samples.points, self.samples.points_dictionary, FLOOR, self.families):
-                yield "grow", min([current, *results], key=self.judged)
-            for _ in range(self.effort.sweeps):
-                current = self._sweep(current, self.samples.points)
-            results.append(self.sharpen(current))
-        best = min(results, key=self.judged)
-        place = next(place for place, result in enumerate(results) if result is best)
-        self._decided("networks" if place else "search", survivors[max(place - 1, 0)][1])
-        yield "polish", best
-
-    def _decided(self, whose: Literal["networks", "search"], pool: Pool) -> None:
-        """Note whose tree is the result, and count the nodes of the proposal that it is, or of the best one."""
-        self.stages.chosen(pool)
-        # What grows from a proposal of one colour is the search's.
-        self.stages.tree_of = whose if self.stages.second_stage_nodes < self.stages.nodes else "search"
-
-    def _proposed(self, pool: Pool) -> Candidate:
-        """The tree of a pool, fitted to the coarse averages."""
-        root = self.proposing.tree(pool)
-        with self.stages.clock("proposals"):
-            return self.fit(within(root, self.samples.coarse, self.effort.max_values) or self.start(), self.samples.coarse, 20)
-
-    def _settled(self, proposed: Candidate) -> Candidate:
-        """A proposal on all points; one that is nearly right with leaves taken out or exchanged, as long as that is better."""
-        current = self.sharpen(self.fit(proposed.root, self.samples.points, self.effort.growth_steps))
-        for _ in range(self.effort.settle_steps):
-            if current.error < FLOOR or current.error > SETTLED:
-                break
-            better = self._offered(current)
-            if better is None:
-                break
-            current = better
-        self.front.add(current)
-        return current
-
-    def _offered(self, current: Candidate) -> Candidate | None:
-        """The best tree with one leaf less or of another kind, its edges hard; None if none is better."""
-        base = soften(current.root, FINE_SOFTNESS)
-        quick = []
-        for root in [base, *removals(base), *swaps(base)]:
-            if count_values(root) <= self.effort.max_values:
-                fitted = fit_pixels(self.samples.points, root, steps=4, softest=FINE_SOFTNESS)
-                quick.append(Candidate(fitted.root, fitted.error))
-        sharp = [self.sharpen(option) for option in sorted(quick, key=settled)[:OFFERED]]
-        best = min(sharp, key=settled)
-        return best if settled(best) < settled(current) - 2e-3 else None
-
-
-class Unproposed(Search):
-    """The search in the place of the hybrid, where there are no networks."""
-
-    def __init__(self, samples: Samples, effort: Effort, why: str) -> None:
-        super().__init__(samples, effort)
-        self.stages = Stages("search", why)

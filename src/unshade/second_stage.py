@@ -3,6 +3,8 @@
 A node is decomposed twice. First its picture as the first stage left it, 64 pixels wide and a little wrong, so that every node has some
 tree. Then, beyond the paper, what it has to show *in its place*: the operators above it are undone with the siblings as they are by
 then, which says at the pixels of the real picture what is missing there. The better of both stays.
+
+The first needs nothing but the node, so nodes may be decomposed side by side.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 
@@ -23,7 +25,7 @@ from unshade.fit.basin_cma import fit_basin_cma
 from unshade.fit.gradient import fit_gradient
 from unshade.fit.pixels import Pixels
 from unshade.growth import Effort, Growth, Samples
-from unshade.inference import Pool
+from unshade.inference import Part, Pool
 from unshade.nodes import Node
 from unshade.proposals import Fits
 from unshade.render import render
@@ -52,6 +54,14 @@ UNSEEN = 1.0e-3
 """So much less than the best seen pixel, and a pixel does not count."""
 
 
+class Found(NamedTuple):
+    """The tree of a node."""
+
+    root: Node
+    fits: int
+    """Of whole structures, that it took."""
+
+
 class SecondStage:
     """By size: our search, a tenth of a second to a few seconds a node.
 
@@ -61,35 +71,36 @@ class SecondStage:
 
     def __init__(self, main: Growth, fits: Fits) -> None:
         self.main, self.fits = main, fits
-        self.count = 0
-        """Fits of whole structures."""
-        self.known: dict[tuple[Image, int], Node] = {}
-        """The trees of pictures with room for so many values: pools share many of the nodes that they leave over."""
 
-    def decompose(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node:
-        """The tree of a node that was left over: of the picture itself where it is the root, else of the node's own."""
-        if not place:
+    def decompose(self, part: Part) -> Found:
+        """The tree of a part that was left over, on the CPU: of the picture itself where it is the root, else of its own."""
+        if not part.depth:
             # Grown, but not looked at as a drawing, which would be the search in the place of the networks.
-            return self._searched(self.main.samples, dataclasses.replace(self.main.effort, beam=0, rounds=0))
-        _, gain = wanted(pool, place, second, self.fits, self.main.samples.coarse)
-        image, room = pool.parts[place].image, _room(gain)
-        if (image, room) not in self.known:
-            self.known[image, room] = self._of_node(Pixels.of(image.cpu(), None, SIZE), room)
-        return self.known[image, room]
+            return _searched(self.main.samples, dataclasses.replace(self.main.effort, beam=0, rounds=0))
+        return _of_node(Pixels.of(part.image, None, SIZE), _room(gain_of(part)))
 
-    def in_place(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node | None:
-        """Another tree of a node below the root, of what it has to show in its place; None where that can hardly be seen."""
+    def in_place(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Found | None:
+        """Another tree of a part below the root, of what it has to show in its place; None where that can hardly be seen."""
         pixels, gain = wanted(pool, place, second, self.fits, self.main.samples.coarse)
-        return self._of_node(pixels, _room(gain)) if gain >= HIDDEN else None
+        return _of_node(pixels, _room(gain)) if gain >= HIDDEN else None
 
-    def _of_node(self, pixels: Pixels, room: int) -> Node:
-        dictionary = dictionary_of(pixels)
-        return self._searched(Samples(pixels, pixels, pixels, dictionary, dictionary), dataclasses.replace(NODE_EFFORT, max_values=room))
 
-    def _searched(self, samples: Samples, effort: Effort) -> Node:
-        steps = [found for _, found in Search(samples, effort).run()]
-        self.count += len(steps)
-        return steps[-1].root
+def _of_node(pixels: Pixels, room: int) -> Found:
+    dictionary = dictionary_of(pixels)
+    return _searched(Samples(pixels, pixels, pixels, dictionary, dictionary), dataclasses.replace(NODE_EFFORT, max_values=room))
+
+
+def _searched(samples: Samples, effort: Effort) -> Found:
+    steps = [found for _, found in Search(samples, effort).run()]
+    return Found(steps[-1].root, len(steps))
+
+
+def gain_of(part: Part) -> float:
+    """How much of a part shows in the picture, root mean square inside the disc: 0 is invisible, 1 is all of it."""
+    if part.gain is None:
+        return 1.0
+    disc = disc_mask(part.gain.shape[-1])
+    return math.sqrt(float(part.gain.square().mean(0, keepdim=True)[disc].mean()))
 
 
 def _room(gain: float) -> int:
@@ -108,30 +119,25 @@ class SecondStageByDepth(SecondStage):
         super().__init__(main, fits)
         self.image, self.valid, self.objective, self.seed = image, valid, objective, seed
 
-    def decompose(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node:
+    def decompose(self, part: Part) -> Found:
         """See the class."""
-        key = (pool.parts[place].image, NODE_EFFORT.max_values)
-        if key in self.known:
-            return self.known[key]
-        image, valid = (key[0].cpu(), disc_mask(key[0].shape[-1])) if place else (self.image, self.valid)
-        found = self.main.start()
+        image, valid = (part.image, disc_mask(part.image.shape[-1])) if part.depth else (self.image, self.valid)
+        found = Found(self.main.start(), 0)
         with torch.inference_mode(False):
             for progress in search_depth.search(
                 image.clone(),
                 valid.clone(),
                 partial(fit_basin_cma, objective=self.objective, meta_steps=6, gradient_steps=10, final_steps=150),
-                NODE_THRESHOLD if place else 0.01,
+                NODE_THRESHOLD if part.depth else 0.01,
                 seed=self.seed,
                 rank=partial(fit_gradient, size=20, steps=50, restarts=3),
                 budget=NODE_BUDGET,
-                max_values=(NODE_EFFORT if place else self.main.effort).max_values,
+                max_values=(NODE_EFFORT if part.depth else self.main.effort).max_values,
             ):
-                found = progress.root
-            self.count += progress.done
-        self.known[key] = found
+                found = Found(progress.root, progress.done)
         return found
 
-    def in_place(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Node | None:
+    def in_place(self, pool: Pool, place: int, second: Mapping[int, Node]) -> Found | None:
         """None: the paper looks at decoded pictures only."""
         return None
 
