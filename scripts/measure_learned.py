@@ -45,7 +45,7 @@ PARTS = ("table", "seconds")
 DRAWS = (12,)
 """Budgets of nodes to draw for (`Inference.draws`) whose seconds are measured."""
 
-TIMED = 4
+TIMED = 10
 """Trees of each style that they are measured on."""
 
 MORE = dataclasses.replace(PRESETS["balanced"].effort, beam=4, beam_moves=8, trials=8, rounds=4, sweeps=2, settle_steps=28)
@@ -189,7 +189,7 @@ def budgets(found: dict[str, Any]) -> str:
         rows = [row for row in found["rows"] if row["draws"] == draws]
         seconds, psnr = sorted(row["seconds"] for row in rows), [row["psnr"] for row in rows]
         drawing = statistics.median(row["stages"]["first stage"] for row in rows)
-        spread = f"{seconds[0]:.0f} / {statistics.median(seconds):.1f} / {seconds[-1]:.0f}"
+        spread = f"{seconds[0]:.1f} / {statistics.median(seconds):.1f} / {seconds[-1]:.1f}"
         quick = f"{sum(number <= 20.0 for number in seconds)} of {len(rows)}"
         lines.append(f"| {draws} | {spread} | {quick} | {drawing:.1f} | {statistics.median(psnr):.1f} / {statistics.fmean(psnr):.1f} |")
     return "\n".join(lines)
