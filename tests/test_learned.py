@@ -16,7 +16,7 @@ from typing import Any, cast
 import pytest
 import torch
 
-from unshade import batch, decoded, inference, learned, search_depth, second_stage, synthesis
+from unshade import batch, crew, decoded, inference, learned, search_depth, second_stage, synthesis
 from unshade.cli import run as run_command
 from unshade.criterion import Terms
 from unshade.decompose import Result, decompose, fit
@@ -439,11 +439,19 @@ def test_what_several_pools_leave_over_is_decomposed_once(tiny: Path, monkeypatc
     assert len(asked) == len(set(asked))
 
 
-@pytest.mark.parametrize("second", ["size", "none"])
-def test_copies_of_the_process_change_no_tree(second: Any, tiny: Path) -> None:
+@pytest.mark.parametrize(("method", "second"), [("learned", "size"), ("learned", "none"), ("hybrid", "size")])
+def test_copies_of_the_process_change_no_tree(method: Any, second: Any, tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inference = dataclasses.replace(SETTINGS, stop=10.0, draws=4, trees=3)
-    settings = [learned.Settings(inference, second_stage=second, threads=count) for count in (1, 2)]
-    one, two = (decompose(picture(PAINTED), method="learned", weights=tiny, preset="draft", settings=given).result() for given in settings)
+    results = []
+    for workers in (1, 2):
+        asked: list[int] = []
+        ask = crew.side_by_side
+        monkeypatch.setattr(crew, "side_by_side", lambda jobs, count, asked=asked, ask=ask: asked.append(count) or ask(jobs, count))
+        settings = learned.Settings(inference, second_stage=second, threads=workers)
+        results.append(decompose(picture(PAINTED), method=method, weights=tiny, preset="draft", settings=settings).result())
+        assert set(asked) == {workers}
+        monkeypatch.undo()
+    one, two = results
     assert one.tree == two.tree and one.family == two.family and one.stages is not None and two.stages is not None
     assert {**one.stages, "seconds": 0} == {**two.stages, "seconds": 0} and one.stages["seconds"].keys() == two.stages["seconds"].keys()
 

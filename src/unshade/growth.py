@@ -11,10 +11,13 @@ error below what 8-bit pictures can show is not worth lowering.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
+from typing import TypeVar
 
+from unshade import crew
 from unshade.atoms import Dictionary
 from unshade.fit.least_squares import COARSE_SOFTNESS, FINE_SOFTNESS, fit_pixels, sharpen
 from unshade.fit.model import Model
@@ -22,6 +25,8 @@ from unshade.fit.pixels import Pixels
 from unshade.fit.plan import NO_LIMITS, Limits
 from unshade.moves import Move, Proposer
 from unshade.nodes import Leaf, Node, count_values, leaf
+
+Answer = TypeVar("Answer")
 
 FLOOR = 5.0e-6
 """Mean squared error that is not worth lowering: rounding to 8 bits alone makes 1.3e-6."""
@@ -157,6 +162,18 @@ class Growth:
         """Fit on the fine points, edges about a pixel wide, then hard where that is better."""
         fitted = sharpen(self.samples.fine, current.root, steps=self.effort.polish_steps, limits=limits)
         return Candidate(fitted.root, fitted.error)
+
+    def side_by_side(self, jobs: Sequence[Callable[[], Answer]], workers: int) -> Iterator[Answer]:
+        """The answers of pieces of this growth, in order (`crew.side_by_side`); what they note on the curve is noted here."""
+
+        def noted(job: Callable[[], Answer]) -> tuple[Answer, Front, Front]:
+            return job(), self.front, self.rough
+
+        with closing(crew.side_by_side([partial(noted, job) for job in jobs], workers)) as answers:
+            for answer, front, rough in answers:
+                self.front.update(front)
+                self.rough.update(rough)
+                yield answer
 
     def grow(
         self,

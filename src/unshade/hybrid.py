@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Literal
 
 from unshade.changes import removals, swaps
@@ -31,6 +32,7 @@ class Hybrid(Search):
         self, image: Image, valid: Mask, samples: Samples, effort: Effort, networks: Networks, settings: Settings, seed: int
     ) -> None:
         super().__init__(samples, effort)
+        self.threads = settings.threads
         self.stages = Stages("hybrid")
         self.proposing = Proposing(image, valid, networks, settings, seed, self.stages)
 
@@ -45,24 +47,21 @@ class Hybrid(Search):
             best = min([best, *(candidate for candidate, _ in trees)], key=lambda candidate: candidate.error)
             yield "propose", best
         survivors = sorted(trees, key=lambda entry: self.judged(entry[0]))[:SURVIVORS]
-        finished: list[Candidate] = []
-        for proposed, pool in survivors:
-            with self.stages.clock("proposals"):
-                finished.append(self._settled(proposed))
-            if finished[-1].error < DRAWN:
+        settling = self.side_by_side([partial(self._settled, proposed) for proposed, _ in survivors], self.threads)
+        grown: list[Candidate] = []
+        for current, (_, pool) in zip(self.stages.timed("proposals", settling), survivors, strict=True):
+            if current.error < DRAWN:
                 self._decided("networks", pool)
-                yield "propose", finished[-1]
+                yield "propose", current
                 return
+            grown.append(current)
         results = []
         for stage, found_ in super().run():
             yield stage, found_
             results = [found_]
-        for current in finished:
-            for current in self.grow(current, self.samples.points, self.samples.points_dictionary, FLOOR, self.families):
-                yield "grow", min([current, *results], key=self.judged)
-            for _ in range(self.effort.sweeps):
-                current = self._sweep(current, self.samples.points)
-            results.append(self.sharpen(current))
+        for current in self.side_by_side([partial(self._finished, current) for current in grown], self.threads):
+            results.append(current)
+            yield "grow", min(results, key=self.judged)
         best = min(results, key=self.judged)
         place = next(place for place, result in enumerate(results) if result is best)
         self._decided("networks" if place else "search", survivors[max(place - 1, 0)][1])
@@ -92,6 +91,13 @@ class Hybrid(Search):
             current = better
         self.front.add(current)
         return current
+
+    def _finished(self, current: Candidate) -> Candidate:
+        """A proposal grown on, with leaves of other kinds and in other places, its edges hard."""
+        *_, current = [current, *self.grow(current, self.samples.points, self.samples.points_dictionary, FLOOR, self.families)]
+        for _ in range(self.effort.sweeps):
+            current = self._sweep(current, self.samples.points)
+        return self.sharpen(current)
 
     def _offered(self, current: Candidate) -> Candidate | None:
         """The best tree with one leaf less or of another kind, its edges hard; None if none is better."""

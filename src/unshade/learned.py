@@ -16,16 +16,15 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, get_args
 
 import torch
 
-from unshade.crew import side_by_side
 from unshade.fit.least_squares import error_of
-from unshade.growth import Candidate, Effort, Front, Growth, Samples
+from unshade.growth import Answer, Candidate, Effort, Growth, Samples
 from unshade.inference import Cause, Inference, Networks, Pool, Round, infer
 from unshade.node_image import node_image
 from unshade.nodes import Node, count_values
@@ -49,8 +48,6 @@ SECOND_NODES = 6
 pictures that leave more over were as good or better (in the mean by 1.2 dB), in 0.7 to 1.0 of the time."""
 
 SecondStageName = Literal["size", "depth", "none"]
-
-Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True)
@@ -121,6 +118,15 @@ class Stages:
             yield
         finally:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begin
+
+    def timed(self, stage: str, work: Iterator[Answer]) -> Iterator[Answer]:
+        """The same, with the time of each step added to a stage."""
+        while True:
+            with self.clock(stage):
+                found = next(work, None)
+            if found is None:
+                return
+            yield found
 
     def as_dict(self) -> dict[str, Any]:
         """Ready for JSON."""
@@ -222,21 +228,7 @@ class Learned(Growth):
             yield part.image, root
 
     def _side_by_side(self, stage: str, jobs: Sequence[Callable[[], Answer]]) -> Iterator[Answer]:
-        """The answers of jobs, in order; what they add to the curve is added here."""
-
-        def noted(job: Callable[[], Answer]) -> tuple[Answer, Front, Front]:
-            return job(), self.rough, self.front
-
-        with closing(side_by_side([partial(noted, job) for job in jobs], self.settings.threads)) as answers:
-            while True:
-                with self.stages.clock(stage):
-                    found = next(answers, None)
-                if found is None:
-                    return
-                answer, rough, front = found
-                self.rough.update(rough)
-                self.front.update(front)
-                yield answer
+        return self.stages.timed(stage, self.side_by_side(jobs, self.settings.threads))
 
     def _in_place(self, placed: Candidate, pool: Pool, second: dict[int, Node]) -> tuple[dict[int, Node], int]:
         """What was left over, each decomposed once more where it stands, if the tree is better so; and the fits that it took."""
