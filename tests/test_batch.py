@@ -289,33 +289,57 @@ def test_what_fails_in_a_copy_is_done_again_here() -> None:
         next(answers)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
-def test_copies_end_with_what_asked_for_them() -> None:
-    def sleeps() -> int:
-        time.sleep(60.0)
-        return 0
+def test_a_worker_of_a_crew_makes_no_copies() -> None:
+    asked = "[*__import__('unshade.crew').crew.side_by_side([__import__('os').getpid] * 3, 2), __import__('os').getpid(), {}]"
+    answers = crew.run([asked.format(number) for number in range(2)], 2, eval, lost, lambda job: None)
+    assert all(len(set(processes)) == 1 and processes[0] != os.getpid() for _, (*processes, _) in answers)
 
-    begin = time.monotonic()
-    answers = crew.side_by_side([os.getpid, sleeps, sleeps], 2)
-    copy = next(answers)
-    answers.close()
-    assert time.monotonic() - begin < 20
-    with pytest.raises(ProcessLookupError):
-        os.kill(copy, 0)
-    # Killed, this process leaves none behind, although each copy holds what the next one knows of the pipes.
-    script = f"""
-import os, sys, time
-sys.path[:0] = {sys.path!r}
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+def test_where_no_process_can_be_made_jobs_are_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuses() -> int:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(os, "fork", refuses)
+    assert list(crew.side_by_side([os.getpid] * 3, 2)) == [os.getpid()] * 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+def test_what_cannot_be_told_by_a_copy_is_done_again_here() -> None:
+    answers = list(crew.side_by_side([lambda: (os.getpid(), threading.Lock()), os.getpid], 2))
+    assert answers[0][0] == os.getpid() != answers[1]  # type: ignore[index]
+
+
+UNTIL_KILLED = """
+import os, signal, sys, time
 from unshade import crew
 def lasts():
     print(os.getpid(), flush=True)
-    time.sleep(2.0)
-list(crew.side_by_side([lasts] * 4, 2))
+    time.sleep({seconds})
+    return os.getpid()
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+answers = crew.side_by_side([os.getpid, lasts, lasts], 2)
+next(answers)
+{then}
 """
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
-        copies = [int(parent.stdout.readline()) for _ in range(2)]
-        parent.kill()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+@pytest.mark.parametrize(
+    ("seconds", "then"),
+    [(60.0, "answers.close()"), (60.0, ""), (60.0, "os.killpg(0, signal.SIGTERM)"), (2.0, "os.kill(os.getpid(), signal.SIGKILL)")],
+    ids=["closed", "left alone", "told to end, all of them", "killed"],
+)
+def test_copies_end_with_what_asked_for_them(seconds: float, then: str) -> None:
+    # A copy that works when this process is killed ends its job first.
+    wait = "time.sleep(0.5)\n"
+    script = UNTIL_KILLED.format(seconds=seconds, then=wait + then)
+    begin = time.monotonic()
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=50, start_new_session=True)
+    copies = [int(line) for line in ran.stdout.split()]
+    assert 1 <= len(copies) <= 2 and time.monotonic() - begin < 50
+    # Only the process itself may say that it was interrupted.
+    assert ran.stderr.count("Traceback") <= (1 if "SIGTERM" in then else 0) and "Process Fork" not in ran.stderr
     deadline = time.monotonic() + 30
     while any(_runs(copy) for copy in copies) and time.monotonic() < deadline:
         time.sleep(0.1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from unshade.decompose import Result, decompose, fit
 from unshade.errors import MissingWeightsError, TreeError, UnshadeError
 from unshade.fit.pixels import Pixels
 from unshade.grammar import same_structure
+from unshade.growth import Growth
 from unshade.inference import Inference, Networks, Part, Pool, Round, infer
 from unshade.models import weights
 from unshade.models.config import find
@@ -31,6 +33,7 @@ from unshade.node_image import node_image
 from unshade.nodes import Leaf, Node, Operator, Tree, leaf, mix, multiply, screen, walk
 from unshade.parameters import Layout
 from unshade.pictures import write_picture
+from unshade.presets import PRESETS
 from unshade.proposals import Fits, arranged
 from unshade.render import evaluate, render
 from unshade.sphere import disc_mask, sphere_normals
@@ -420,7 +423,20 @@ def test_a_node_that_shows_little_of_itself_gets_few_values() -> None:
     assert second_stage.gain_of(dataclasses.replace(part, gain=half)) == pytest.approx(0.5**0.5, abs=0.01)
 
 
-def test_what_several_pools_leave_over_is_decomposed_once(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def pair(networks: Networks, monkeypatch: pytest.MonkeyPatch) -> tuple[Pool, Pool]:
+    """Two pools in the place of what is drawn, each of a root with two parts that are left over, one of them in both."""
+    rounds = [pools(endless(networks), dataclasses.replace(SETTINGS, draws=1, trees=1), seed)[-1] for seed in (0, 1)]
+    (first,), (second,) = (found.pools for found in rounds)
+    place = second.left_over[0]
+    parts = list(second.parts)
+    parts[place] = dataclasses.replace(first.parts[first.left_over[0]], cause="loss")
+    drawn = Round((first, Pool(tuple(parts))), 2)
+    monkeypatch.setattr(learned, "infer", lambda *_: iter([drawn]))
+    return first, drawn.pools[1]
+
+
+def test_what_several_pools_leave_over_is_decomposed_once(pair: tuple[Pool, Pool], tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Image] = []
     decompose_ = second_stage.SecondStage.decompose
 
@@ -429,31 +445,44 @@ def test_what_several_pools_leave_over_is_decomposed_once(tiny: Path, monkeypatc
         return decompose_(self, part)
 
     monkeypatch.setattr(second_stage.SecondStage, "decompose", noted)
-    # Nothing is good enough, so each pool leaves its root over.
-    settings = learned.Settings(dataclasses.replace(SETTINGS, stop=-1.0), threads=1)
-    found = decompose(picture(SIMPLE), method="learned", weights=tiny, preset="draft", settings=settings).result()
-    assert len(asked) == 1 and found.stages is not None and found.stages["second_stage_fits"] > 1
-    asked.clear()
-    few = learned.Settings(dataclasses.replace(SETTINGS, stop=10.0, draws=4, trees=3), threads=1)
-    decompose(picture(PAINTED), method="learned", weights=tiny, preset="draft", settings=few).result()
-    assert len(asked) == len(set(asked))
+    decompose(picture(SIMPLE), method="learned", weights=tiny, preset="draft", settings=learned.Settings(threads=1)).result()
+    assert [len(pool.left_over) for pool in pair] == [2, 2]
+    assert len(asked) == 3 == len({id(image) for image in asked})
 
 
-@pytest.mark.parametrize(("method", "second"), [("learned", "size"), ("learned", "none"), ("hybrid", "size")])
-def test_copies_of_the_process_change_no_tree(method: Any, second: Any, tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    inference = dataclasses.replace(SETTINGS, stop=10.0, draws=4, trees=3)
+@pytest.mark.parametrize(
+    ("method", "second", "side_by_side"), [("learned", "size", [3, 2, 2]), ("learned", "none", [2, 2]), ("hybrid", "size", [2, 2])]
+)
+def test_copies_of_the_process_change_no_tree(
+    method: Any, second: Any, side_by_side: list[int], pair: tuple[Pool, Pool], tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ask = crew.side_by_side
     results = []
     for workers in (1, 2):
         asked: list[int] = []
-        ask = crew.side_by_side
-        monkeypatch.setattr(crew, "side_by_side", lambda jobs, count, asked=asked, ask=ask: asked.append(count) or ask(jobs, count))
-        settings = learned.Settings(inference, second_stage=second, threads=workers)
+
+        def noted(jobs: Any, count: int, asked: list[int] = asked, workers: int = workers) -> Any:
+            asked.append(len(jobs))
+            assert count == workers
+            return ask(jobs, count)
+
+        monkeypatch.setattr(crew, "side_by_side", noted)
+        settings = learned.Settings(second_stage=second, threads=workers)
         results.append(decompose(picture(PAINTED), method=method, weights=tiny, preset="draft", settings=settings).result())
-        assert set(asked) == {workers}
-        monkeypatch.undo()
+        assert asked == side_by_side
     one, two = results
     assert one.tree == two.tree and one.family == two.family and one.stages is not None and two.stages is not None
     assert {**one.stages, "seconds": 0} == {**two.stages, "seconds": 0} and one.stages["seconds"].keys() == two.stages["seconds"].keys()
+    assert second == "none" or method == "hybrid" or one.stages["second_stage_fits"] > 3
+
+
+def test_what_copies_note_on_the_curve_is_noted_here() -> None:
+    pixels = Pixels.of(picture(SIMPLE))
+    samples: Any = SimpleNamespace(coarse=None, points=pixels)
+    growth = Growth(samples, PRESETS["draft"].effort)
+    trees = [leaf("albedo", color=(0.5, 0.4, 0.3)), SIMPLE]
+    found = list(growth.side_by_side([partial(growth.fit, root, pixels, 1) for root in trees], 2))
+    assert growth.front.best == {candidate.values: candidate for candidate in found} and len(found) == 2
 
 
 def test_looking_at_a_node_in_its_place_mends_what_was_decoded_badly(monkeypatch: pytest.MonkeyPatch) -> None:

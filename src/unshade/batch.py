@@ -78,7 +78,7 @@ class Job:
     folder: Path | None
     settings: Settings
     threads: int = field(default=1, compare=False)
-    """Of the networks. They answer alike on any number; the search and the fits have one."""
+    """Of the networks, and processes for the fits of what they drew; the tree is the same on any number. A search has one."""
 
 
 def digest(path: Path) -> str:

@@ -125,7 +125,7 @@ def cli(context: click.Context) -> None:
     "--workers",
     type=click.IntRange(1),
     metavar="N",
-    help="Processes for several pictures, threads of the networks where these are fewer; all cores when not given.",
+    help="Processes for several pictures; for one, threads of its networks and processes for its fits; all cores when not given.",
 )
 @click.option("--resume/--force", default=True, help="Skip pictures that are done with the same settings (the default), or do them again.")
 @output_options

@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import multiprocessing.connection
+import os
 import pickle
 import signal
 import sys
 import threading
+import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from multiprocessing import resource_tracker
@@ -16,6 +18,8 @@ from typing import Any, Generic, Literal, TypeVar
 
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
+
+_STARTING = threading.Lock()
 
 
 def run(
@@ -77,32 +81,42 @@ def side_by_side(jobs: Sequence[Callable[[], Answer]], workers: int) -> Generato
     Each job works on a copy of this process, which costs hundredths of a second and knows all that this one knows; what it changes there
     is lost, except for its answer, which must be picklable. A job that fails in a copy is done again here, so its error is raised here.
     Copies are made on Linux only; elsewhere, in a worker of a crew, and where there is one worker, jobs are done here, one after the other.
-    They must neither print nor wait for other threads, which a copy does not have, nor touch a GPU.
+
+    A copy has none of the other threads: a job must not wait for them, hence compute with one thread of PyTorch, and neither print nor
+    touch a GPU.
     """
-    alone = sys.platform != "linux" or multiprocessing.current_process().daemon
-
-    def work(number: int) -> bytes | None:
-        try:
-            # Pickled here, since a pipe would have PyTorch move tensors by files in shared memory.
-            return pickle.dumps(jobs[number]())
-        except Exception:  # noqa: BLE001 - whatever it is, it comes again where it can be raised
-            return None
-
-    if alone or workers < 2 or len(jobs) < 2:
+    if sys.platform != "linux" or multiprocessing.current_process().daemon or workers < 2 or len(jobs) < 2:
         for job in jobs:
             yield job()
         return
-    answers: dict[int, bytes | None] = {}
-    following = iter(range(len(jobs)))
-    place = next(following)
-    crew = run(range(len(jobs)), workers, work, lambda number, code: None, lambda number: None, "fork")
-    with contextlib.closing(crew):
-        for number, answer in crew:
-            answers[number] = answer
-            while place in answers:
-                told = answers.pop(place)
-                yield jobs[place]() if told is None else pickle.loads(told)
-                place = next(following, -1)
+
+    def work(place: int) -> bytes | None:
+        try:
+            # Pickled here, since a pipe would have PyTorch move tensors by files in shared memory.
+            return pickle.dumps(jobs[place]())
+        except Exception:  # noqa: BLE001 - whatever it is, it comes again where it can be raised
+            if os.environ.get("UNSHADE_DEBUG"):
+                traceback.print_exc()
+            return None
+
+    told: dict[int, bytes | None] = {}
+    with contextlib.closing(run(range(len(jobs)), workers, work, lambda *_: None, lambda _: None, "fork")) as answers:
+        for place, job in enumerate(jobs):
+            while place not in told:
+                try:
+                    told.update([next(answers)])
+                except OSError:  # no more processes, or no memory for them
+                    told = dict.fromkeys(range(len(jobs))) | told
+            yield _unpickled(told.pop(place), job)
+
+
+def _unpickled(told: bytes | None, job: Callable[[], Answer]) -> Answer:
+    """What a copy answered, or the job done here."""
+    with contextlib.suppress(Exception):
+        if told is not None:
+            answer: Answer = pickle.loads(told)
+            return answer
+    return job()
 
 
 class _Lost(Exception):  # noqa: N818 - a message from `take` to `run`, not an error to report
@@ -114,17 +128,19 @@ class _Worker(Generic[Job, Answer]):
     """One process and the job that it works on."""
 
     def __init__(self, work: Callable[[Job], Answer], job: Job, start: Literal["spawn", "fork"]) -> None:
-        self.pipe, other = multiprocessing.Pipe()
         self.forked = start == "fork"
         process = multiprocessing.get_context("fork").Process if self.forked else multiprocessing.get_context("spawn").Process
-        # A copy holds both ends of its pipe: it closes the one that is not its own, or it would outlive this process.
-        self.process = process(target=_serve, args=(other, work, self.pipe if self.forked else None), daemon=True)
-        self.alive = True
-        with _uninterrupted(), warnings.catch_warnings():
-            # From Python 3.12 on: "This process is multi-threaded, use of fork() may lead to deadlocks in the child".
-            warnings.simplefilter("ignore", DeprecationWarning)
-            self.process.start()
-        other.close()
+        # One at a time, or a copy that another thread makes would hold both ends of this pipe.
+        with _STARTING:
+            self.pipe, other = multiprocessing.Pipe()
+            # A copy holds both ends of its own pipe: it closes the one that is not its, or it would outlive this process.
+            self.process = process(target=_serve, args=(other, work, self.pipe if self.forked else None), daemon=True)
+            self.alive = True
+            with _uninterrupted(self.forked), warnings.catch_warnings():
+                # From Python 3.12 on: "This process is multi-threaded, use of fork() may lead to deadlocks in the child".
+                warnings.simplefilter("ignore", DeprecationWarning)
+                self.process.start()
+            other.close()
         self.give(job)
 
     def give(self, job: Job) -> None:
@@ -164,6 +180,8 @@ def _serve(
     if parents is not None:
         parents.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The command takes this as an interrupt too, which a copy would print.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if sys.platform != "win32":
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     with contextlib.suppress(EOFError, OSError):
@@ -172,7 +190,7 @@ def _serve(
 
 
 @contextlib.contextmanager
-def _uninterrupted() -> Iterator[None]:
+def _uninterrupted(forked: bool = False) -> Iterator[None]:
     """Processes started in here know no Ctrl-C from their first moment on, before they can say so themselves.
 
     Here it waits: one that comes in the meantime interrupts at the end, when the new process has all that it needs.
@@ -180,8 +198,9 @@ def _uninterrupted() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread() or sys.platform == "win32":
         yield
         return
-    # This process's helper lets signals through when it starts, so it starts first.
-    resource_tracker.ensure_running()
+    if not forked:
+        # This process's helper lets signals through when it starts, so it starts first.
+        resource_tracker.ensure_running()
     came: list[int] = []
     # Children inherit what is blocked. A thread that does not block it, such as a progress bar's, may still be sent it.
     before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))

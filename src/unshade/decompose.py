@@ -93,6 +93,8 @@ class Decomposition(Iterator[Step]):
     def cancel(self) -> None:
         """Stop after the current step. `result` then holds the best tree so far."""
         self._cancelled = True
+        # Let go of the work, with the processes that it may have.
+        self._work = iter(())
 
     def result(self) -> Result:
         """Run to the end and return what was found; after `cancel`, the best so far, its family that tree alone."""

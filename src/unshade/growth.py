@@ -25,6 +25,7 @@ from unshade.fit.pixels import Pixels
 from unshade.fit.plan import NO_LIMITS, Limits
 from unshade.moves import Move, Proposer
 from unshade.nodes import Leaf, Node, count_values, leaf
+from unshade.threads import threads
 
 Answer = TypeVar("Answer")
 
@@ -167,7 +168,8 @@ class Growth:
         """The answers of pieces of this growth, in order (`crew.side_by_side`); what they note on the curve is noted here."""
 
         def noted(job: Callable[[], Answer]) -> tuple[Answer, Front, Front]:
-            return job(), self.front, self.rough
+            with threads(1):
+                return job(), self.front, self.rough
 
         with closing(crew.side_by_side([partial(noted, job) for job in jobs], workers)) as answers:
             for answer, front, rough in answers:

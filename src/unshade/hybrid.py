@@ -32,7 +32,7 @@ class Hybrid(Search):
         self, image: Image, valid: Mask, samples: Samples, effort: Effort, networks: Networks, settings: Settings, seed: int
     ) -> None:
         super().__init__(samples, effort)
-        self.threads = settings.threads
+        self.workers = settings.threads
         self.stages = Stages("hybrid")
         self.proposing = Proposing(image, valid, networks, settings, seed, self.stages)
 
@@ -47,7 +47,7 @@ class Hybrid(Search):
             best = min([best, *(candidate for candidate, _ in trees)], key=lambda candidate: candidate.error)
             yield "propose", best
         survivors = sorted(trees, key=lambda entry: self.judged(entry[0]))[:SURVIVORS]
-        settling = self.side_by_side([partial(self._settled, proposed) for proposed, _ in survivors], self.threads)
+        settling = self.side_by_side([partial(self._settled, proposed) for proposed, _ in survivors], self.workers)
         grown: list[Candidate] = []
         for current, (_, pool) in zip(self.stages.timed("proposals", settling), survivors, strict=True):
             if current.error < DRAWN:
@@ -59,7 +59,7 @@ class Hybrid(Search):
         for stage, found_ in super().run():
             yield stage, found_
             results = [found_]
-        for current in self.side_by_side([partial(self._finished, current) for current in grown], self.threads):
+        for current in self.side_by_side([partial(self._finished, current) for current in grown], self.workers):
             results.append(current)
             yield "grow", min(results, key=self.judged)
         best = min(results, key=self.judged)

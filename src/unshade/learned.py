@@ -123,9 +123,10 @@ class Stages:
         """The same, with the time of each step added to a stage."""
         while True:
             with self.clock(stage):
-                found = next(work, None)
-            if found is None:
-                return
+                try:
+                    found = next(work)
+                except StopIteration:
+                    return
             yield found
 
     def as_dict(self) -> dict[str, Any]:
