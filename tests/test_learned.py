@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,9 +21,7 @@ from unshade.cli import run as run_command
 from unshade.criterion import Terms
 from unshade.decompose import Result, decompose, fit
 from unshade.errors import MissingWeightsError, TreeError, UnshadeError
-from unshade.fit.pixels import Pixels
 from unshade.grammar import same_structure
-from unshade.growth import Growth
 from unshade.inference import Inference, Networks, Part, Pool, Round, infer
 from unshade.models import weights
 from unshade.models.config import find
@@ -33,8 +30,7 @@ from unshade.node_image import node_image
 from unshade.nodes import Leaf, Node, Operator, Tree, leaf, mix, multiply, screen, walk
 from unshade.parameters import Layout
 from unshade.pictures import write_picture
-from unshade.presets import PRESETS
-from unshade.proposals import Fits, arranged
+from unshade.proposals import arranged
 from unshade.render import evaluate, render
 from unshade.sphere import disc_mask, sphere_normals
 from unshade.types import Image
@@ -387,42 +383,6 @@ def test_the_ablation_takes_parts_away(monkeypatch: pytest.MonkeyPatch) -> None:
     assert none.stages["second_stage"] == "none" and none.stages["left_over"] == {"loss": 1, "depth": 0, "nodes": 0, "draws": 0}
 
 
-def test_undoing_the_operators_gives_what_a_node_shows() -> None:
-    paint, shade, light = PAINTED.children[0].children[0], PAINTED.children[0].children[1], PAINTED.children[1]  # type: ignore[union-attr]
-    blank = torch.zeros(3, 8, 8)
-    codes = Codes(*[torch.zeros(1)] * 4)
-    root = Part(blank, codes, "operator", "split", 0, operator="screen", children=(1, 2))
-    body = Part(blank, codes, "operator", "split", 1, operator="multiply", children=(3, 4))
-    rest = Part(blank, codes, "operator", "left over", 1)
-    pool = Pool((root, body, rest, rest, rest))
-    true = {2: light, 3: paint, 4: shade}
-    pixels = Pixels.of(picture(PAINTED))
-    for place, node in true.items():
-        others = {other: node for other, node in true.items() if other != place}
-        found, gain = second_stage.wanted(pool, place, others, Fits(), pixels)
-        shown = render(node, found.normals[:, None])[:, 0]
-        assert (found.target - shown).abs().max() < 1e-3 and 0.1 < gain < 1.0
-        assert found.weight.sum().item() == pytest.approx(1.0, abs=1e-5)
-    hidden = {2: leaf("albedo", color=(1.0, 1.0, 1.0)), 4: shade}
-    assert second_stage.wanted(pool, 3, hidden, Fits(), pixels)[1] < second_stage.HIDDEN
-    assert second_stage.SecondStage(SimpleNamespace(samples=SimpleNamespace(coarse=pixels)), Fits()).in_place(pool, 3, hidden) is None  # type: ignore[arg-type]
-
-
-def test_a_node_that_shows_little_of_itself_gets_few_values() -> None:
-    stage = second_stage.SecondStage(SimpleNamespace(), Fits())  # type: ignore[arg-type]
-    codes, image = Codes(*[torch.zeros(1)] * 4), picture(PAINTED, 64)
-    sizes = []
-    for gain in (0.01, 0.25, 1.0):
-        part = Part(image, codes, "operator", "left over", 1, gain=torch.full_like(image, gain))
-        assert second_stage.gain_of(part) == pytest.approx(gain)
-        sizes.append(Tree(stage.decompose(part).root).values)
-    most = second_stage.NODE_EFFORT.max_values
-    assert sizes[0] == 3 < sizes[1] <= most / 2 < sizes[2] <= most
-    assert second_stage.gain_of(dataclasses.replace(part, gain=None)) == 1.0
-    half = torch.full_like(image, 1.0) * (torch.arange(64) < 32)
-    assert second_stage.gain_of(dataclasses.replace(part, gain=half)) == pytest.approx(0.5**0.5, abs=0.01)
-
-
 @pytest.fixture
 def pair(networks: Networks, monkeypatch: pytest.MonkeyPatch) -> tuple[Pool, Pool]:
     """Two pools in the place of what is drawn, each of a root with two parts that are left over, one of them in both."""
@@ -474,15 +434,6 @@ def test_copies_of_the_process_change_no_tree(
     assert one.tree == two.tree and one.family == two.family and one.stages is not None and two.stages is not None
     assert {**one.stages, "seconds": 0} == {**two.stages, "seconds": 0} and one.stages["seconds"].keys() == two.stages["seconds"].keys()
     assert second == "none" or method == "hybrid" or one.stages["second_stage_fits"] > 3
-
-
-def test_what_copies_note_on_the_curve_is_noted_here() -> None:
-    pixels = Pixels.of(picture(SIMPLE))
-    samples: Any = SimpleNamespace(coarse=None, points=pixels)
-    growth = Growth(samples, PRESETS["draft"].effort)
-    trees = [leaf("albedo", color=(0.5, 0.4, 0.3)), SIMPLE]
-    found = list(growth.side_by_side([partial(growth.fit, root, pixels, 1) for root in trees], 2))
-    assert growth.front.best == {candidate.values: candidate for candidate in found} and len(found) == 2
 
 
 def test_looking_at_a_node_in_its_place_mends_what_was_decoded_badly(monkeypatch: pytest.MonkeyPatch) -> None:
