@@ -16,6 +16,7 @@ from typing import Any, cast
 import pytest
 import torch
 
+from lit_spheres import PAINTED, SIMPLE, picture
 from unshade import batch, crew, decoded, inference, learned, search_depth, second_stage, synthesis
 from unshade.cli import run as run_command
 from unshade.criterion import Terms
@@ -27,11 +28,11 @@ from unshade.models import weights
 from unshade.models.config import find
 from unshade.models.vqvae import Codes
 from unshade.node_image import node_image
-from unshade.nodes import Leaf, Node, Operator, Tree, leaf, mix, multiply, screen, walk
+from unshade.nodes import Leaf, Node, Operator, Tree, leaf, walk
 from unshade.parameters import Layout
 from unshade.pictures import write_picture
 from unshade.proposals import arranged
-from unshade.render import evaluate, render
+from unshade.render import evaluate
 from unshade.sphere import disc_mask, sphere_normals
 from unshade.types import Image
 
@@ -55,16 +56,6 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def networks(tiny: Path) -> Networks:
     return Networks.load(tiny)
-
-
-def picture(root: Node, size: int = 96) -> torch.Tensor:
-    return render(root, sphere_normals(size))
-
-
-SIMPLE = screen(
-    multiply(leaf("albedo", color=(0.8, 0.3, 0.2)), leaf("diffuse", direction=(0.3, 0.6, 0.7), ambient=0.3)),
-    leaf("highlight", direction=(-0.3, 0.4, 0.85), sharpness=40.0, amplitude=1.0),
-)
 
 
 def pools(networks: Networks, settings: Inference, seed: int = 0) -> list[Round]:
@@ -345,19 +336,6 @@ def decomposed(root: Node, monkeypatch: pytest.MonkeyPatch, **options: Any) -> R
     monkeypatch.setattr(Networks, "load", lambda *_: oracle)
     options = {"settings": learned.Settings(Inference(samples=2)), **options}
     return decompose((picture(root, 256) * 255.0).round() / 255.0, **options).result()
-
-
-PAINTED = screen(
-    multiply(
-        mix(
-            leaf("albedo", color=(0.8, 0.6, 0.2)),
-            leaf("albedo", color=(0.2, 0.3, 0.6)),
-            leaf("threshold", direction=(0.4, 0.2, 0.9), threshold=0.4),
-        ),
-        leaf("toon_diffuse", direction=(0.3, 0.6, 0.7), ambient=0.4, threshold=0.0, softness=0.1),
-    ),
-    leaf("toon_highlight", direction=(-0.3, 0.5, 0.8), radius=0.25, brightness=0.6),
-)
 
 
 @pytest.mark.parametrize("root", [SIMPLE, PAINTED], ids=["realistic", "toon"])

@@ -10,33 +10,16 @@ from typing import Any
 import pytest
 import torch
 
+from lit_spheres import PAINTED, picture
 from unshade import second_stage
 from unshade.fit.pixels import Pixels
 from unshade.growth import Growth
 from unshade.inference import Part, Pool
 from unshade.models.vqvae import Codes
-from unshade.nodes import Node, Tree, leaf, mix, multiply, screen
+from unshade.nodes import Tree, leaf
 from unshade.presets import PRESETS
 from unshade.proposals import Fits
 from unshade.render import render
-from unshade.sphere import sphere_normals
-from unshade.types import Image
-
-PAINTED = screen(
-    multiply(
-        mix(
-            leaf("albedo", color=(0.8, 0.6, 0.2)),
-            leaf("albedo", color=(0.2, 0.3, 0.6)),
-            leaf("threshold", direction=(0.4, 0.2, 0.9), threshold=0.4),
-        ),
-        leaf("toon_diffuse", direction=(0.3, 0.6, 0.7), ambient=0.4, threshold=0.0, softness=0.1),
-    ),
-    leaf("toon_highlight", direction=(-0.3, 0.5, 0.8), radius=0.25, brightness=0.6),
-)
-
-
-def picture(root: Node, size: int = 96) -> Image:
-    return render(root, sphere_normals(size))
 
 
 def test_undoing_the_operators_gives_what_a_node_shows() -> None:
