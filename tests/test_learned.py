@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import weakref
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -469,7 +470,9 @@ def test_a_hybrid_is_never_worse_than_a_search(tiny: Path) -> None:
 def test_a_learned_decomposition_can_be_cancelled(tiny: Path) -> None:
     work = decompose(picture(SIMPLE), method="learned", weights=tiny, **DRAFT)
     stages = [next(work).stage, next(work).stage]
+    held = weakref.ref(work._work)
     work.cancel()
+    assert held() is None, "what it is at, copies of the process among it, ends at once"
     assert stages == ["start", "propose"] and work.result().tree.leaves >= 1
 
 

@@ -20,6 +20,7 @@ from unshade.nodes import Tree, leaf
 from unshade.presets import PRESETS
 from unshade.proposals import Fits
 from unshade.render import render
+from unshade.threads import threads
 
 
 def test_undoing_the_operators_gives_what_a_node_shows() -> None:
@@ -65,3 +66,10 @@ def test_what_copies_note_on_the_curve_is_noted_here() -> None:
     trees = [leaf("albedo", color=(0.5, 0.4, 0.3)), PAINTED]
     found = list(growth.side_by_side([partial(growth.fit, root, pixels, 1) for root in trees], 2))
     assert growth.front.best == {candidate.values: candidate for candidate in found} and len(found) == 2
+
+
+def test_jobs_of_a_growth_compute_with_one_thread() -> None:
+    samples: Any = SimpleNamespace(coarse=None)
+    with threads(2):
+        for workers in (1, 2):
+            assert list(Growth(samples, PRESETS["draft"].effort).side_by_side([torch.get_num_threads] * 2, workers)) == [1, 1]
