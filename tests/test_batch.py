@@ -249,7 +249,7 @@ def test_settings_are_told_apart_by_their_fingerprint(picture: Path) -> None:
 
 
 def test_cores_is_a_positive_number() -> None:
-    assert 1 <= batch.cores() <= (os.cpu_count() or 1)
+    assert 1 <= crew.cores() <= (os.cpu_count() or 1)
 
 
 def test_jobs_side_by_side_answer_in_order_and_change_nothing_here() -> None:

@@ -223,11 +223,6 @@ def limit_threads() -> None:
     torch.set_num_threads(1)
 
 
-def cores() -> int:
-    """The cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def decompose_picture(job: Job, on_step: Callable[[Step], None] | None = None) -> Record:
     """Read, decompose and write one picture. A failure comes back as a record with ``error``, so that the rest goes on."""
     try:

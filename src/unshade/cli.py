@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from unshade import __version__, batch, cli_extract, cli_verbs
+from unshade import __version__, batch, cli_extract, cli_verbs, crew
 from unshade.arguments import SEED, check_networks, network_options, output_options, read_document, read_tree
 from unshade.errors import TreeError, UnshadeError
 from unshade.staging import check_folder
@@ -173,7 +173,7 @@ def decompose(
     for job, record in done.items():
         _tell(record, messages, "done before  ")
         printed.add(job, record)
-    workers = workers or batch.cores()
+    workers = workers or crew.cores()
     todo = [job for job in jobs if job not in done]
     todo = [dataclasses.replace(job, threads=max(workers // len(todo), 1)) for job in todo]
     failures = []

@@ -53,7 +53,7 @@ def make(output: Path, workers: int | None, quiet: bool, as_json: bool, **option
       unshade dataset make both -o data --trees 20000
       unshade dataset make toon -o data/toon-test --split test --trees 500 --size 128
     """
-    from unshade import batch, synthesis_shards
+    from unshade import crew, synthesis_shards
     from unshade.terminal import Messages
 
     plan = synthesis_shards.Plan(**options)
@@ -67,7 +67,7 @@ def make(output: Path, workers: int | None, quiet: bool, as_json: bool, **option
                 advance()
             shown = made
 
-        manifest = synthesis_shards.make(plan, output, workers or batch.cores(), done)
+        manifest = synthesis_shards.make(plan, output, workers or crew.cores(), done)
     messages.say(f"{output}: {_line(manifest)}")
     if as_json:
         click.echo(json.dumps(_brief(manifest)))

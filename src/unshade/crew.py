@@ -22,6 +22,11 @@ Answer = TypeVar("Answer")
 _STARTING = threading.Lock()
 
 
+def cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def run(
     jobs: Sequence[Job],
     workers: int,

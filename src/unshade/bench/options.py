@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +18,6 @@ def default_data() -> Path:
     """The first that exists: ``data`` here, ``shared/data`` one folder up, the example pictures."""
     candidates = (Path("data"), Path("..", "shared", "data"), Path("examples"))
     return next((path for path in candidates if path.is_dir()), candidates[0])
-
-
-def cores() -> int:
-    """The cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass(frozen=True)

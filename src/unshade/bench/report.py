@@ -14,11 +14,11 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from unshade import __version__
+from unshade import __version__, crew
 from unshade.bench import plot, sheet
 from unshade.bench.journal import Row
 from unshade.bench.measures import quantile
-from unshade.bench.options import Options, cores
+from unshade.bench.options import Options
 from unshade.errors import MissingExtraError, OutputError
 
 PRIVATE = ("tree", "perceptual", "seed", "dataset", "method")
@@ -104,7 +104,7 @@ def document(options: Options, dataset: str, method: str, rows: Sequence[Row]) -
 
 def machine() -> dict[str, Any]:
     """What it ran on, without a name of the host."""
-    return {"system": platform.system(), "architecture": platform.machine(), "processor": _processor(), "cores": cores()}
+    return {"system": platform.system(), "architecture": platform.machine(), "processor": _processor(), "cores": crew.cores()}
 
 
 def _processor() -> str:

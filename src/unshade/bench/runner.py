@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
 import time
-from collections.abc import Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,16 +10,14 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from unshade import serde
+from unshade import crew, serde
 from unshade.bench import report
 from unshade.bench.datasets import Case, find_cases, load
 from unshade.bench.journal import Journal, Row, key_of
 from unshade.bench.measures import measure
 from unshade.bench.methods import method_of
-from unshade.bench.options import Options, cores, default_data
+from unshade.bench.options import Options, default_data
 from unshade.errors import UnshadeError
-
-THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 @dataclass
@@ -83,7 +76,7 @@ def run(options: Options, console: Console | None = None) -> Measured:
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task("measuring", total=len(tasks), completed=len(tasks) - len(waiting))
         try:
-            for task, row in _measure_all(waiting, options.workers or cores()):
+            for task, row in crew.run(waiting, options.workers or crew.cores(), measure_task, _lost, _forget):
                 if "error" in row:
                     measured.failed.append(f"{task.method} on {task.case.dataset}/{task.case.name}: {row['error']}")
                 else:
@@ -96,39 +89,10 @@ def run(options: Options, console: Console | None = None) -> Measured:
     return measured
 
 
-def _measure_all(tasks: list[Task], workers: int) -> Iterator[tuple[Task, Row]]:
-    if workers == 1 or len(tasks) <= 1:
-        limit_threads()
-        for task in tasks:
-            yield task, measure_task(task)
-        return
-    with ProcessPoolExecutor(min(workers, len(tasks)), multiprocessing.get_context("spawn"), initializer=_start_worker) as pool:
-        futures: dict[Future[Row], Task] = {}
-        try:
-            futures = {pool.submit(measure_task, task): task for task in tasks}
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
-
-
-def limit_threads() -> None:
-    """One thread: processor seconds are then the cost of one core, and sums come in one order on any machine."""
-    torch.set_num_threads(1)
-
-
-def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for name in THREADS:
-        os.environ[name] = "1"
-    limit_threads()
-
-
 def measure_task(task: Task) -> Row:
     """One row, or a row with only ``error``. A failure of one picture does not end the run."""
+    # Processor seconds are then the cost of one core, and sums come in one order on any machine.
+    torch.set_num_threads(1)
     try:
         subject = load(task.case, task.seed)
         wall, processor = time.perf_counter(), time.process_time()
@@ -149,3 +113,11 @@ def measure_task(task: Task) -> Row:
         "curve": [list(point) for point in outcome.curve],
         "tree": serde.dumps(outcome.tree),
     }
+
+
+def _lost(task: Task, code: int | None) -> Row:
+    return {"error": f"its process ended with exit code {code}"}
+
+
+def _forget(task: Task) -> None:
+    """Nothing of a task is on disk before it is done."""

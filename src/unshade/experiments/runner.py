@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from unshade.bench.options import cores
+from unshade import crew
 from unshade.bench.report import machine, versions
 from unshade.errors import MissingExtraError, OutputError, UnshadeError, did_you_mean
 from unshade.experiments import addition, methods, plots, sheets
@@ -67,7 +67,7 @@ def run(options: Options, console: Console | None = None) -> Ran:
     for name, why in ran.skipped.items():
         tell(f"skipped {name}: {why}")
     earlier = {part: _earlier(options, part) for part in options.parts}
-    work = Work(options.journal, options.workers or cores(), options.resume, console)
+    work = Work(options.journal, options.workers or crew.cores(), options.resume, console)
     for part in options.parts:
         tell(f"{part}: {', '.join(able)}")
         context = Context(options, able, work.measure, measured)
