@@ -184,13 +184,6 @@ class TestRun:
         if importlib.util.find_spec("matplotlib"):
             assert (options.out / "curve.png").exists() and "<svg" in (options.out / "curve.svg").read_text()
 
-    def test_two_processes_measure_the_same(self, options):
-        def rows(workers):
-            measured = bench.run(bench.Options(**{**vars(options), "workers": workers, "fresh": True}))
-            return [(row["name"], row["psnr"], row["tree"]) for row in measured.rows]
-
-        assert rows(2) == rows(1) and len(rows(1)) == 2
-
     def test_it_goes_on_where_it_was_and_starts_again_when_asked(self, options, counted):
         bench.run(options)
         bench.run(options)

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from unshade import __version__, crew
 from unshade.errors import OutputError, PictureError, UnshadeError
+from unshade.files import add_line
 from unshade.staging import TREE_FILE, discard
 
 if TYPE_CHECKING:
@@ -189,21 +190,8 @@ class Log:
             return
         entry = record | {"folder": job.folder.name, "source": _identity(job.picture)}
         entry["fingerprint"] = job.settings.fingerprint(job.picture) if fingerprint is None else fingerprint
-        try:
-            with self.path.open("a+b") as file:
-                # Start on a fresh line even after one that was cut off.
-                if file.tell() and not self._ends_whole():
-                    file.write(b"\n")
-                file.write(json.dumps(entry).encode() + b"\n")
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error
+        add_line(self.path, json.dumps(entry))
         self.entries[job.folder.name] = entry
-
-    def _ends_whole(self) -> bool:
-        assert self.path is not None
-        with self.path.open("rb") as file:
-            file.seek(-1, os.SEEK_END)
-            return file.read(1) == b"\n"
 
 
 def forgo_torchscript() -> None:

@@ -1,12 +1,15 @@
-"""Writing a file whole or not at all."""
+"""Writing a file whole or not at all, or line by line."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import secrets
+from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 from unshade.errors import OutputError
 
@@ -53,3 +56,25 @@ def write_whole(path: str | os.PathLike[str], data: bytes) -> None:
             raise
     except OSError as error:
         raise OutputError(f"cannot write {target}: {error.strerror or error}") from error
+
+
+def save_whole(path: str | os.PathLike[str], save: Callable[[BinaryIO], object]) -> None:
+    """`write_whole` of what ``save`` puts into a file. Raises OutputError."""
+    held = io.BytesIO()
+    save(held)
+    write_whole(path, held.getvalue())
+
+
+def add_line(path: str | os.PathLike[str], line: str) -> None:
+    """Add a line to a file, which is made where there is none; a last line that a kill or a full disk cut short stays one of its own.
+
+    Raises OutputError.
+    """
+    try:
+        with open(path, "a+b") as file:
+            if file.tell():
+                file.seek(-1, os.SEEK_END)
+            begins = b"" if file.read(1) in (b"", b"\n") else b"\n"
+            file.write(begins + line.encode() + b"\n")
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror or error}") from error

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from unshade.errors import OutputError
+from unshade.files import add_line, write_whole
 
 
 class Log:
@@ -23,7 +24,7 @@ class Log:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             kept = [line for line in self._lines() if _step(line) <= step]
-            self.path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+            write_whole(self.path, "".join(f"{line}\n" for line in kept).encode())
         except OSError as error:
             raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from None
         try:
@@ -40,11 +41,7 @@ class Log:
         """Figures of the training or test split at a step. Raises OutputError."""
         if not self._writes:
             return
-        try:
-            with open(self.path, "a", encoding="utf-8") as file:
-                file.write(json.dumps({"step": step, "split": split, **figures}) + "\n")
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from None
+        add_line(self.path, json.dumps({"step": step, "split": split, **figures}))
         if self._board is not None:
             for name, value in figures.items():
                 self._board.add_scalar(f"{split}/{name}", value, step)

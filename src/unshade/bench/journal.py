@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from unshade.errors import OutputError
+from unshade.files import add_line
 
 Row = dict[str, Any]
 
@@ -31,9 +32,9 @@ class Journal:
         self.rows: dict[tuple[Any, ...], Row] = {}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Ended by a power cut or a kill, the last line may be half a row.
-            text = path.read_text(encoding="utf-8") if path.exists() else ""
-            path.write_text(text, encoding="utf-8") if not text or text.endswith("\n") else path.write_text(text + "\n", encoding="utf-8")
+            path.touch()
+            # Ended by a power cut or a full disk, the last line may be half a row.
+            text = path.read_text(encoding="utf-8", errors="replace")
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
         for line in text.splitlines():
@@ -42,10 +43,9 @@ class Journal:
                 self.rows[key_of(row, fields)] = row
 
     def add(self, row: Row) -> None:
-        """Keep a row, at once."""
+        """Keep a row, at once. Raises OutputError."""
+        add_line(self.path, json.dumps(row))
         self.rows[key_of(row, self.fields)] = row
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
 
 
 def _parse(line: str, fields: Sequence[str]) -> Row | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from unshade.errors import MissingExtraError
+from unshade.files import save_whole
 
 
 def curves(documents: Sequence[dict[str, Any]], folder: Path) -> None:
@@ -30,8 +31,8 @@ def curves(documents: Sequence[dict[str, Any]], folder: Path) -> None:
             panel.set_visible(False)
         for panel, dataset in zip(axes.flat, datasets, strict=False):
             _panel(panel, dataset, [document for document in documents if document["dataset"] == dataset])
-        figure.savefig(folder / "curve.png", dpi=120, metadata={"Software": None})
-        figure.savefig(folder / "curve.svg", metadata={"Date": None, "Creator": None})
+        save_whole(folder / "curve.png", lambda file: figure.savefig(file, dpi=120, metadata={"Software": None}))
+        save_whole(folder / "curve.svg", lambda file: figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None}))
         pyplot.close(figure)
 
 

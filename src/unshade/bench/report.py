@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import sys
 from collections.abc import Callable, Sequence
@@ -20,6 +19,7 @@ from unshade.bench.journal import Row
 from unshade.bench.measures import quantile
 from unshade.bench.options import Options
 from unshade.errors import MissingExtraError, OutputError
+from unshade.files import write_whole
 
 PRIVATE = ("tree", "perceptual", "seed", "dataset", "method")
 """Fields of the journal that do not stand in each row of the results: a tree renders to a copy of its picture."""
@@ -55,12 +55,10 @@ def write(options: Options, rows: Sequence[Row], skipped: dict[str, str], failed
         results.mkdir(parents=True, exist_ok=True)
         for dataset, method in dict.fromkeys((row["dataset"], row["method"]) for row in rows):
             chosen = [row for row in rows if (row["dataset"], row["method"]) == (dataset, method)]
-            _write_text(
-                results / f"{dataset}.{method}.json".replace(":", "-"),
-                json.dumps(document(options, dataset, method, chosen), indent=1) + "\n",
-            )
+            text = json.dumps(document(options, dataset, method, chosen), indent=1) + "\n"
+            write_whole(results / f"{dataset}.{method}.json".replace(":", "-"), text.encode())
         documents = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(results.glob("*.*.json"))]
-        _write_text(options.out / "results.md", table(documents))
+        write_whole(options.out / "results.md", table(documents).encode())
         _draw(lambda: plot.curves(documents, options.out), console)
         _draw(lambda: sheet.worst(options, rows, options.out / "sheets"), console)
     except OSError as error:
@@ -76,12 +74,6 @@ def _draw(draw: Callable[[], object], console: Console) -> None:
         draw()
     except MissingExtraError as error:
         console.print(f"not drawn: {error}", markup=False, highlight=False)
-
-
-def _write_text(path: Path, text: str) -> None:
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_text(text, encoding="utf-8", newline="\n")
-    scratch.replace(path)
 
 
 def document(options: Options, dataset: str, method: str, rows: Sequence[Row]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ Sheets show the pictures themselves, so they go to a folder that the repository 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,6 +17,7 @@ from unshade import serde
 from unshade.bench.datasets import find_cases, load
 from unshade.bench.journal import Row
 from unshade.bench.options import Options, default_data
+from unshade.files import save_whole
 from unshade.render import render
 from unshade.sphere import sphere_normals
 from unshade.types import Image
@@ -46,7 +48,7 @@ def worst(options: Options, rows: Sequence[Row], folder: Path) -> list[Path]:
             caption = f"{row['name']}  {row['psnr']:.1f} dB  {row['values']} values, {row['leaves']} leaves"
             pen.text((left + 4, top + CELL + 4), caption, fill="#e0e0e0")
         path = folder / f"{dataset}.{method}.png".replace(":", "-")
-        sheet.save(path)
+        save_whole(path, partial(sheet.save, format="PNG"))
         written.append(path)
     return written
 

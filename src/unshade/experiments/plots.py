@@ -10,6 +10,7 @@ from typing import Any
 from unshade.errors import MissingExtraError
 from unshade.experiments.damage import CLEAN, DAMAGES
 from unshade.experiments.summaries import groups
+from unshade.files import save_whole
 
 Document = dict[str, Any]
 
@@ -67,7 +68,7 @@ def _panels(path: Path, count: int, fill: Callable[[list[Any]], None], columns: 
         else:
             figure.legend([*named.values()], [*named], loc="outside upper center", ncols=min(len(named), 2 * columns), frameon=False)
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=160, metadata={"Software": None})
+        save_whole(path, lambda file: figure.savefig(file, dpi=160, metadata={"Software": None}))
         pyplot.close(figure)
 
 

@@ -22,6 +22,7 @@ from unshade.experiments import subjects
 from unshade.experiments.options import Options
 from unshade.experiments.summaries import groups
 from unshade.experiments.understanding import Question, truths
+from unshade.files import save_whole
 from unshade.pictures import SIZE
 from unshade.render import render
 from unshade.sphere import disc_mask, sphere_normals
@@ -63,7 +64,7 @@ def draw(path: Path, *tables: Table) -> Path | None:
     if not filled:
         return None
     path.parent.mkdir(parents=True, exist_ok=True)
-    sheet(*filled).save(path, optimize=True)
+    save_whole(path, lambda file: sheet(*filled).save(file, "PNG", optimize=True))
     return path
 
 
