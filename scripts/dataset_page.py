@@ -275,7 +275,7 @@ training half alone it would learn those by heart. So {made} are made up
 ([made_environments.py](../src/unshade/made_environments.py): noise with a random spectrum, a sky and a ground, windows and lamps, suns),
 and all are mirrored, recoloured, joined with real ones, and given other contrasts, blurs and exposures; {UNALTERED_SHARE:.0%} of the
 batches see the real ones as they are. So does the test half. Pictures of the training half, the same without
-their environment, and the environments:
+their environment, and the environments (where one is white, nothing of what is beneath is left in the picture: black specks):
 
 ![reflections](dataset/reflections.png)
 """
