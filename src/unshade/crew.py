@@ -32,7 +32,7 @@ def run(
     workers: int,
     work: Callable[[Job], Answer],
     lost: Callable[[Job, int | None], Answer],
-    abandoned: Callable[[Job], None],
+    abandoned: Callable[[Job], None] = lambda _: None,
     start: Literal["spawn", "fork"] = "spawn",
 ) -> Generator[tuple[Job, Answer]]:
     """Do the jobs on ``workers`` processes and yield each with its answer as it is done, in any order.
@@ -46,7 +46,7 @@ def run(
         workers: most processes at once.
         work: does one job; it should not raise.
         lost: the answer for a job whose process died, from its exit code.
-        abandoned: cleans up after a job that was cut short.
+        abandoned: cleans up after a job that was cut short, where it leaves something behind.
         start: how a process begins; see `side_by_side` for what a fork asks.
     """
     if workers == 1 or len(jobs) <= 1:
@@ -105,7 +105,7 @@ def side_by_side(jobs: Sequence[Callable[[], Answer]], workers: int) -> Generato
             return None
 
     told: dict[int, bytes | None] = {}
-    with contextlib.closing(run(range(len(jobs)), workers, work, lambda *_: None, lambda _: None, "fork")) as answers:
+    with contextlib.closing(run(range(len(jobs)), workers, work, lambda *_: None, start="fork")) as answers:
         for place, job in enumerate(jobs):
             while place not in told:
                 try:

@@ -85,7 +85,7 @@ def make(plan: Plan, folder: Path, workers: int = 1, done: Callable[[int, int], 
     total = len(jobs) + len(entries)
     done(len(entries), total)
     try:
-        for job, entry in crew.run(jobs, workers, _made, _lost, lambda job: None):
+        for job, entry in crew.run(jobs, workers, _made, _lost):
             if isinstance(entry, UnshadeError):
                 raise entry
             entries[job.index] = entry

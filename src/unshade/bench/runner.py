@@ -76,7 +76,7 @@ def run(options: Options, console: Console | None = None) -> Measured:
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task("measuring", total=len(tasks), completed=len(tasks) - len(waiting))
         try:
-            for task, row in crew.run(waiting, options.workers or crew.cores(), measure_task, _lost, _forget):
+            for task, row in crew.run(waiting, options.workers or crew.cores(), measure_task, _lost):
                 if "error" in row:
                     measured.failed.append(f"{task.method} on {task.case.dataset}/{task.case.name}: {row['error']}")
                 else:
@@ -117,7 +117,3 @@ def measure_task(task: Task) -> Row:
 
 def _lost(task: Task, code: int | None) -> Row:
     return {"error": f"its process ended with exit code {code}"}
-
-
-def _forget(task: Task) -> None:
-    """Nothing of a task is on disk before it is done."""

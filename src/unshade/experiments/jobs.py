@@ -157,7 +157,7 @@ class Work:
         bad: set[tuple[Any, ...]] = set()
         with Progress(*columns, console=self.console, disable=not self.console.is_terminal) as progress:
             bar = progress.add_task("measuring", total=len(unique), completed=len(unique) - len(waiting))
-            for job, row in crew.run(waiting, self.workers, row_of, _lost, _forget):
+            for job, row in crew.run(waiting, self.workers, row_of, _lost):
                 what = f"{job.method} on {job.case.dataset}/{job.case.name}"
                 if "error" in row:
                     self.failed.append(f"{what}: {row['error']}")
@@ -172,7 +172,3 @@ class Work:
 
 def _lost(job: Job, code: int | None) -> Row:
     return job.about | {"error": f"its process ended with exit code {code}"}
-
-
-def _forget(job: Job) -> None:
-    """Nothing of a job is on disk before it is done."""
