@@ -11,7 +11,7 @@ import torch
 
 from lit_spheres import PAINTED, picture
 from pretended_gpu import GPU, DevicesError, pretended_gpu
-from unshade import inference, train
+from unshade import train
 from unshade.decompose import Result, decompose
 from unshade.inference import Inference, Networks, infer
 from unshade.learned import Settings
@@ -92,11 +92,9 @@ def test_only_networks_are_on_the_gpu(
 ) -> None:
     """Fits are on the CPU, those in copies of the process among them, which a GPU would refuse."""
     monkeypatch.setenv("UNSHADE_DEBUG", "1")  # a copy tells why it failed; its job would be done here
-    inference._loaded.cache_clear()
     settings = Settings(inference=DRAWN, device="cuda:0", threads=2)
     with pretended_gpu():
         work = decompose(picture(PAINTED), preset="draft", method=method, weights=weights, settings=settings)
         found: Result = work.result()
     assert found.stages is not None and found.stages["method"] == method and found.stages["drawn_nodes"] > 1
     assert "DevicesError" not in capfd.readouterr().err
-    inference._loaded.cache_clear()
